@@ -28,6 +28,7 @@ from colmap_av1.images.recognising import check_content
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.gaps import fast_frames, matching_warnings
 from colmap_av1.matching.image_matches import PairedImages
+from colmap_av1.matching.initial_adjustment import KnownPoses
 from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
 from colmap_av1.matching.links import LinkReport
 from colmap_av1.matching.match_images import (
@@ -243,10 +244,11 @@ def match(
         )
         cameras = _listed_cameras(database, listed, images) if listed else None
         found = _match_images(images, cameras, scratch, options, context)
-        # With a guessed focal length the poses of pairs are wrong and cannot be compared.
-        known = all(camera.has_prior_focal_length for camera in found.cameras)
-        poses = found.poses if isinstance(found, JointMatches) and known else ()
-        written = demote_bad_initial_pairs(found.matched, found.cameras, clock, poses)
+        known = None
+        if isinstance(found, JointMatches):
+            is_known = all(camera.has_prior_focal_length for camera in found.cameras)
+            known = KnownPoses(found.poses, are_comparable=is_known)
+        written = demote_bad_initial_pairs(found.matched, found.cameras, clock, known)
         num_written, blurred = 0, list[str]()
         if folder is not None:
             check_videos()

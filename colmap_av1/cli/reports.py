@@ -67,8 +67,9 @@ def match_rows(report: MatchReport) -> Rows:
 
 def _estimate_rows(estimate: JointEstimate, num_images: int) -> Rows:
     """The joint estimate of all poses that matches were verified against."""
+    registered = " + ".join(map(str, estimate.num_registered))
     return [
-        ("joint estimate", f"{estimate.num_registered} of {num_images} images registered"),
+        ("joint estimate", f"{registered} of {num_images} images registered"),
         *_dynamic_row(estimate.moving),
         *_long_range_rows(estimate.far_views, estimate.far_views_largest),
         _focal_length_row(estimate.focal_lengths),

@@ -145,19 +145,26 @@ class KnownPoses:
     """Known poses, which the poses of pairs are compared with.
 
     Attributes:
-        cam_from_world: float64 [3, 4] of each image, None if not known; empty if none is known.
+        models: for each model, float64 [3, 4] cam_from_world of each image, None if it is not in
+            the model. The relative pose of images in different models is not known.
+        are_comparable: whether the poses of pairs can be compared with these. They are wrong if the
+            focal length of the images is a guess.
     """
 
-    cam_from_world: Sequence[_Floats | None] = ()
+    models: Sequence[Sequence[_Floats | None]] = ()
+    are_comparable: bool = False
 
     def rotation(self, pair: Sequence[int]) -> _Floats | None:
         """The rotation from the first camera of a pair to the second; None if not known."""
-        if not self.cam_from_world:
-            return None
-        first, second = (self.cam_from_world[image] for image in pair)
-        if first is None or second is None:
-            return None
-        return np.asarray(second[:, :3] @ first[:, :3].T)
+        for cam_from_world in self.models if self.are_comparable else ():
+            first, second = (cam_from_world[image] for image in pair)
+            if first is not None and second is not None:
+                return np.asarray(second[:, :3] @ first[:, :3].T)
+        return None
+
+    def in_first(self, pair: Sequence[int]) -> bool:
+        """Whether a pair belongs to the first model, or no model is known."""
+        return not self.models or all(self.models[0][image] is not None for image in pair)
 
     def contradict(self, pair: Sequence[int], rotation: _Floats, angle: float) -> bool:
         """Whether a pair's rotation is off by a large share of its triangulation angle."""
@@ -208,6 +215,9 @@ def bad_initial_pairs(
     up to the first pair that the mapper certainly accepts and that is stable. If there is no such
     pair, they are tried again with the mapper's lower limits.
 
+    Trainers open the model that the mapper makes first, which should be the first known model. So
+    the limits are lowered until the mapper certainly accepts one of its pairs.
+
     Args:
         matched: the images.
         cameras: the camera of each image.
@@ -230,12 +240,12 @@ def bad_initial_pairs(
             if counts[k] >= limits[0] and angle >= _WIDE_SHARE * limits[1]
         }
         starts = _starts(matched, cameras, known, limits=limits, left_out=bad)
-        if known.cam_from_world or any(start.is_stable for start in starts.values()):
+        if known.are_comparable or any(start.is_stable for start in starts.values()):
             bad |= {k for k, start in starts.items() if not start.is_stable}
         sure = {k for k, start in starts.items() if start.is_sure}
         if sure:
             break
-    if known.cam_from_world and limits != _LIMITS[0]:
+    if known.are_comparable and limits != _LIMITS[0]:
         # The mapper tries hundreds of pairs with few inliers, and RANSAC may give any of them a
         # wrong pose with a large angle. Neighbours keep their inliers, which connect them.
         apart = np.diff(matched.pairs.reshape(-1, 2), axis=1)[:, 0] > _NEIGHBOURS
@@ -298,15 +308,17 @@ class _Start:
     Attributes:
         is_stable: bundle adjustment keeps the intrinsics near their initial values.
         is_certain: the mapper accepts the pair with any seed.
+        is_first: the pair belongs to the first known model.
     """
 
     is_stable: bool
     is_certain: bool
+    is_first: bool
 
     @property
     def is_sure(self) -> bool:
-        """Whether the mapper accepts the pair with any seed, and its model does not diverge."""
-        return self.is_stable and self.is_certain
+        """Whether the mapper accepts the pair with any seed, and makes the first known model."""
+        return self.is_stable and self.is_certain and self.is_first
 
 
 def _try_start(
@@ -331,6 +343,7 @@ def _try_start(
     if not _is_wide(pose, angle / min_angle, _QUICK_SHARE):
         return None
     inliers = inliers_of(matched, cameras, pair, geometry)
+    unstable = _Start(is_stable=False, is_certain=False, is_first=known.in_first(pair))
     rotations, certain = list[_Floats](), list[bool]()
     for rows, pose, angle in _poses(inliers):
         # A pose just below the limits is tried, too: with another seed the mapper may accept it.
@@ -339,20 +352,21 @@ def _try_start(
             continue
         rotation = pose[:, :3]
         if known.contradict(pair, rotation, angle):
-            return _Start(is_stable=False, is_certain=False)
+            return unstable
         # Adjustment from nearly the same pose has the same result, so it is not repeated.
         if all(_angle_between(own, rotation) > _SAME * angle for own in rotations):
             is_stable = _is_stable(inliers, rows, pose, min_angle)
             if is_stable is None:
                 continue
             if not is_stable:
-                return _Start(is_stable=False, is_certain=False)
+                return unstable
         rotations.append(rotation)
         enough = len(rows) >= _MARGIN * min_inliers
         certain.append(enough and _is_wide(pose, share, _MARGIN))
     if not certain:
         return None
-    return _Start(True, len(certain) >= _NUM_SEEDS and all(certain))
+    is_certain = len(certain) >= _NUM_SEEDS and all(certain)
+    return replace(unstable, is_stable=True, is_certain=is_certain)
 
 
 def _some_inliers(

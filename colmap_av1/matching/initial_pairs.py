@@ -43,7 +43,7 @@ def demote_bad_initial_pairs(
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
     clock: Clock,
-    poses: Sequence[_Floats | None] = (),
+    known: KnownPoses | None = None,
 ) -> MatchedImages:
     """Limit the inliers of pairs that would make a bad initial pair.
 
@@ -59,12 +59,11 @@ def demote_bad_initial_pairs(
             matrix, which needs known focal lengths.
         cameras: the camera of each image.
         clock: gets the stage "verification".
-        poses: float64 [3, 4] cam_from_world of each image, None if not known; empty if no pose is
-            known. Pairs whose own pose disagrees with these are demoted, too.
+        known: known poses, if any. Pairs whose own pose disagrees with these are demoted, too.
     """
     geometries = list(matched.geometries)
     with clock.measure("verification"):
-        known = KnownPoses(poses)
+        known = known if known is not None else KnownPoses()
         misleading = known.misleading_pairs(matched, cameras)
         for k, (pair, geometry) in enumerate(zip(matched.pairs.tolist(), geometries, strict=True)):
             if _may_start(geometry):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import copy
+import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import (
@@ -35,6 +38,9 @@ LOSS_SCALES = (1.0, 0.25)
 OBSERVATIONS = 400
 # Points with more observations keep at least this many.
 _FEWEST_KEPT = 8
+# The covariance of intrinsics is estimated from this number of observations per image, with this
+# standard deviation in pixels.
+_OBSERVATIONS_OF_ERRORS, _ERROR = 100, 0.25
 # Step of the phase in which consecutive points keep observations: the fractional part of the golden
 # ratio. Points that are observed in the same images then keep different ones.
 _PHASE_STEP = (5**0.5 - 1) / 2
@@ -119,6 +125,54 @@ def adjust_posed(
     ahead = np.isfinite(reprojection_errors(adjusted))
     points, enough = keep_observations(adjusted.points, ahead)
     return Adjusted(replace(adjusted, points=points), left[enough])
+
+
+def focal_length_errors(model: PosedModel) -> dict[int, float]:
+    """Relative standard deviation of the focal length of each camera, by camera id.
+
+    It follows from the covariance of a bundle adjustment of poses, points and intrinsics, in which
+    the errors of observations are independent.
+
+    Args:
+        model: an adjusted model, with points. About 100 observations per image are used.
+
+    Returns:
+        Infinite for cameras whose focal length is not determined.
+    """
+    used = used_observations(model.points, len(model.images), _OBSERVATIONS_OF_ERRORS)
+    points, _ = keep_observations(model.points, used)
+    with tempfile.TemporaryDirectory() as folder:
+        write_model(Path(folder), model.cameras, model.images, points)
+        found = read_model(Path(folder))
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in found.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    holder: Any = getattr(options, "ceres", options)  # the options themselves before COLMAP 4
+    holder.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    holder.loss_function_scale = LOSS_SCALES[-1]
+    create: Any = getattr(
+        pycolmap,
+        "create_default_ceres_bundle_adjuster",
+        pycolmap.create_default_bundle_adjuster,  # before COLMAP 4
+    )
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # no warning about infinite ones
+    try:
+        covariance = pycolmap.estimate_ba_covariance(
+            pycolmap.BACovarianceOptions(), found, create(options, config, found)
+        )
+    finally:
+        pycolmap.logging.minloglevel = level
+    errors = dict.fromkeys(model.cameras, math.inf)
+    for number, camera in found.cameras.items():
+        own = covariance.get_other_params_cov(camera.params) if covariance is not None else None
+        if own is not None:
+            at = camera.focal_length_idxs()[0]
+            errors[number] = _ERROR * math.sqrt(own[at, at]) / camera.params[at]
+    return errors
 
 
 def used_observations(points: ModelPoints, num_images: int, mean: float) -> NDArray[np.bool_]:

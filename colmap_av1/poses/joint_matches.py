@@ -29,7 +29,9 @@ from colmap_av1.matching.image_matches import PairedImages, verify_images
 from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
+from colmap_av1.poses.adjusting import focal_length_errors
 from colmap_av1.poses.estimate import Posed, estimate_poses
+from colmap_av1.poses.further_models import further_poses
 from colmap_av1.poses.posed_images import PosedImages, posed_images_of, triangulate_in
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.starting_pair import StartingPair, starting_pair
@@ -68,6 +70,11 @@ _NUM_SAMPLED = 5
 _SAME_POINT = 1.0
 # Two tracks of one video this close to each other, in pixels, are the same.
 _SAME_TRACK = 0.01
+# Largest relative standard deviation of a focal length that the adjustment determines. On walks
+# with turns it is 0.5 %, and the focal length is off by 0.1 to 0.3 %. On a straight drive they
+# are 1.3 and 7 %. COLMAP's mapper registers all images of the drive then; with the initial guess it
+# registers 5 of 51.
+_FOCAL_LENGTH_ERROR = 0.03
 # Largest number of matches of the initial pair.
 _MAX_INITIAL_MATCHES = 300
 
@@ -77,7 +84,8 @@ class JointEstimate:
     """Results of the joint estimate of all poses.
 
     Attributes:
-        num_registered: number of registered images.
+        num_registered: number of registered images of each model. Models are not connected; the
+            figures below are of the first.
         far_views: median long-range epipolar error in pixels, over pairs of images ten or more
             apart; None if no such images overlap.
         far_views_largest: its 90th percentile.
@@ -85,7 +93,7 @@ class JointEstimate:
         focal_lengths: the shortest and the longest focal length of the registered images in pixels.
     """
 
-    num_registered: int
+    num_registered: tuple[int, ...]
     far_views: float | None
     far_views_largest: float | None
     moving: float | None
@@ -98,11 +106,12 @@ class JointMatches(ImageMatches):
 
     Attributes:
         estimate: results of the estimate.
-        poses: float64 [3, 4] cam_from_world of each image; None if it is not registered.
+        poses: for each model, float64 [3, 4] cam_from_world of each image; None for images of other
+            models.
     """
 
     estimate: JointEstimate
-    poses: list[NDArray[np.float64] | None]
+    poses: list[list[NDArray[np.float64] | None]]
 
 
 def match_jointly(
@@ -131,64 +140,99 @@ def match_jointly(
     far = posed.far_views.result if posed.far_views is not None else None
     if far is not None and far.apart:
         raise ModelError("images far apart in time contradict the poses")
-    known = read_posed_model(run.stages / posed.last.result.poses)
+    first = _model_of(run, posed, image_set)
+    models = [first]
+    for own in further_poses(run, posed, image_set, lambda: [v.tracks for v in videos]):
+        models.append(_model_of(own.run, own.posed, own.image_set))
+    registered = {image.name for model in models for image in model.placed.images}
+    left = [name for name in image_set.images.names if name not in registered]
     with run.clock.measure("pairs"):
-        agreeing = _agreeing_tracks(run, posed, image_set, known, density)
-        paired = _paired(run, image_set, agreeing, density)
-    cameras = _cameras(run, image_set, known)
+        others = _tracks_of_unregistered(run, posed, image_set, left, density)
+        others = _within_models(others, models, image_set)
+        agreeing = [_agreeing_tracks(model, image_set, others, density) for model in models]
+        paired = _paired(run, image_set, agreeing, others, density)
+    cameras = _cameras(run, image_set, first.known)
     matched = verify_images(paired, cameras, run.options.match.verify, run.context)
     matches = posed.matches.result
-    pose_of = {image.name: image.cam_from_world for image in known.images}
-    left = [name for name in image_set.images.names if name not in pose_of]
-    focal = [known.cameras[image.camera_id].mean_focal_length() for image in known.images]
+    focal = [camera.mean_focal_length() for camera in first.placed.camera_of_image]
     return JointMatches(
         cameras=cameras,
-        focal_length=_focal_length(run, cameras[0], guessed=matches.guessed),
+        focal_length=_focal_length(run, cameras[0]),
         matched=matched,
         links=matches.links,
         link_tracks=posed.links,
         track_lengths=paired.track_lengths,
         depth=matches.depth,
-        warnings=(*matches.link_warnings, *_warnings(posed, left, len(image_set.sequence))),
+        warnings=(*matches.link_warnings, *_warnings(models, left, len(image_set.sequence))),
         estimate=JointEstimate(
-            num_registered=len(known.images),
+            num_registered=tuple(len(model.placed.images) for model in models),
             far_views=far.far_views if far is not None else None,
             far_views_largest=far.far_views_largest if far is not None else None,
             moving=posed.dynamic.result.moving if posed.dynamic is not None else None,
             focal_lengths=(min(focal), max(focal)),
         ),
-        poses=[pose_of.get(name) for name in image_set.images.names],
+        poses=[model.poses_of(image_set) for model in models],
     )
 
 
 @dataclass(frozen=True)
+class _Model:
+    """A model of the joint estimate.
+
+    Attributes:
+        run: its run.
+        posed: its stages.
+        known: its poses and points.
+        placed: its registered images, except those of an earlier model.
+    """
+
+    run: Run
+    posed: Posed
+    known: PosedModel
+    placed: PosedImages
+
+    def poses_of(self, image_set: ImageSet) -> list[NDArray[np.float64] | None]:
+        """float64 [3, 4] cam_from_world of each image; None for images of other models."""
+        pose_of = {image.name: image.cam_from_world for image in self.placed.images}
+        return [pose_of.get(name) for name in image_set.images.names]
+
+
+def _model_of(run: Run, posed: Posed, image_set: ImageSet) -> _Model:
+    """The finished model of a run, with those of its images that are in the set."""
+    known = read_posed_model(run.stages / posed.last.result.poses)
+    return _Model(run, posed, known, posed_images_of(known, image_set))
+
+
+@dataclass(frozen=True)
 class _Agreeing:
-    """Tracks that agree with the poses, in the registered images.
+    """Tracks that agree with the poses of a model, in its registered images.
 
     Attributes:
         placed: the registered images.
         tracks: the tracks, without outliers: first the corners, then motion tracks.
         num_corners: number of corners.
-        others: tracks with observations in images that are not registered.
         start: the initial pair for a mapper, and the tracks to match it by; None if there is none.
     """
 
     placed: PosedImages
     tracks: Tracks
     num_corners: int
-    others: Tracks
     start: StartingPair | None
 
 
 def _agreeing_tracks(
-    run: Run, posed: Posed, image_set: ImageSet, known: PosedModel, density: DensityOptions
+    model: _Model, image_set: ImageSet, others: Tracks, density: DensityOptions
 ) -> _Agreeing:
-    """The corners of a model and a selection of motion tracks, without outliers."""
-    assert posed.adjustment is not None  # `match` always adjusts
-    placed = posed_images_of(known, image_set)
-    others = _tracks_of_unregistered(run, posed, image_set, placed, density)
-    num_motion = posed.adjustment.result.num_motion_points
-    corners, corner_points = _agreeing_corners(known, num_motion, image_set)
+    """The corners of a model and a selection of motion tracks, without outliers.
+
+    Args:
+        model: the model.
+        image_set: all images.
+        others: tracks with observations in images that are not registered.
+        density: which motion tracks are selected.
+    """
+    run, posed, placed = model.run, model.posed, model.placed
+    corners, corner_points = _agreeing_corners(model, image_set)
     repeated = at_same_place(corners, others, _SAME_TRACK)
     corners, corner_points = corners.keep_tracks(~repeated), corner_points[~repeated]
     every = pose_tracks(run, posed.tracks).keep_frames(placed.frames)
@@ -210,23 +254,19 @@ def _agreeing_tracks(
             motion = motion.keep_tracks(~at_same_place(motion, first, _SAME_TRACK))
             both = Tracks.concatenate(corners, motion, first)
             start = replace(start, points=np.arange(both.num_tracks)[-first.num_tracks :])
-    return _Agreeing(placed, both, corners.num_tracks, others, start)
+    return _Agreeing(placed, both, corners.num_tracks, start)
 
 
-def _agreeing_corners(
-    known: PosedModel, num_motion: int, image_set: ImageSet
-) -> tuple[Tracks, NDArray[np.float64]]:
-    """The corners and SIFT links used in the adjustment, without outliers, and their points.
-
-    Args:
-        known: the adjusted model.
-        num_motion: number of its points from motion tracks, which come first.
-        image_set: all images.
-    """
+def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, NDArray[np.float64]]:
+    """The corners and SIFT links used in the adjustment, without outliers, and their points."""
+    known, adjustment = model.known, model.posed.adjustment
+    assert adjustment is not None  # `match` always adjusts
     errors = reprojection_errors(known)
     adjusted = tracks_of_model(known, image_set)
     agrees = errors <= max(_LEAST_ERROR, _MEDIAN_ERRORS * float(np.median(errors)))
-    agrees &= adjusted.track >= num_motion
+    # Points of motion tracks come first.
+    agrees &= adjusted.track >= adjustment.result.num_motion_points
+    agrees &= np.isin(adjusted.frame, model.placed.frames)
     enough = np.bincount(adjusted.track[agrees], minlength=adjusted.num_tracks) >= _NUM_KEPT
     kept = adjusted.keep_observations(agrees & enough[adjusted.track])
     return kept, known.points.xyz[enough]
@@ -337,57 +377,91 @@ def _first_middle_last(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[np.bo
 
 
 def _paired(
-    run: Run, image_set: ImageSet, agreeing: _Agreeing, density: DensityOptions
+    run: Run,
+    image_set: ImageSet,
+    agreeing: Sequence[_Agreeing],
+    others: Tracks,
+    density: DensityOptions,
 ) -> PairedImages:
     """Match registered images along the tracks that agree with the poses, others along all."""
-    frames, start = image_set.images.frames, agreeing.start
-    kept = _kept_observations(agreeing, frames, _limits(run, image_set, density))
-    matched = Tracks.concatenate(agreeing.tracks.keep_observations(kept), agreeing.others)
-    placed = agreeing.placed.frames
-    pair = list[int]()
-    if start is not None:
-        pair = np.searchsorted(frames, placed[[start.first, start.second]]).tolist()
+    frames, limits = image_set.images.frames, _limits(run, image_set, density)
+    tracks, starts = list[Tracks](), list[StartingPair]()
+    num_tracks = 0
+    for own in agreeing:
+        kept = _kept_observations(own, frames, limits)
+        tracks.append(own.tracks.keep_observations(kept))
+        if own.start is not None:
+            # Tracks without a kept observation are gone, which changes the numbers of the others.
+            is_kept = np.add.reduceat(kept, own.tracks.offsets[:-1]) > 0
+            views = own.placed.frames[[own.start.first, own.start.second]]
+            first, second = np.searchsorted(frames, views).tolist()
+            points = np.cumsum(is_kept)[own.start.points] - 1 + num_tracks
+            starts.append(StartingPair(first, second, points))
+        num_tracks += tracks[-1].num_tracks
 
     def choose(keypoints: list[ImageKeypoints]) -> NDArray[np.int32]:
         min_matches = run.options.match.pairs.min_matches
         pairs = covisible_pairs(keypoints, min_matches, near=_NEAR, most_pairs=_MAX_PAIRS)
-        if start is None:
-            return pairs
-        return np.unique(np.vstack([pairs, np.array(pair, np.int32)]), axis=0)
+        initial = [[start.first, start.second] for start in starts]
+        return np.unique(np.vstack([pairs, np.array(initial, np.int32).reshape(-1, 2)]), axis=0)
 
-    paired = pair_by_tracks(matched, frames, choose)
-    if start is None:
-        return paired
-    # Tracks without a kept observation are gone, which changes the numbers of the others.
-    is_kept = np.add.reduceat(kept, agreeing.tracks.offsets[:-1]) > 0
-    wide = np.cumsum(is_kept)[start.points] - 1
-    number = int(np.flatnonzero((paired.pairs == pair).all(axis=1))[0])
+    paired = pair_by_tracks(Tracks.concatenate(*tracks, others), frames, choose)
     matches = list(paired.matches)
-    track = paired.keypoints[pair[0]].track[matches[number][:, 0]]
-    matches[number] = matches[number][np.isin(track, wide)]
+    for start in starts:
+        is_pair = (paired.pairs == [start.first, start.second]).all(axis=1)
+        number = int(np.flatnonzero(is_pair)[0])
+        track = paired.keypoints[start.first].track[matches[number][:, 0]]
+        matches[number] = matches[number][np.isin(track, start.points)]
     return replace(paired, matches=matches)
 
 
 def _tracks_of_unregistered(
-    run: Run, posed: Posed, image_set: ImageSet, placed: PosedImages, density: DensityOptions
+    run: Run, posed: Posed, image_set: ImageSet, left: Sequence[str], density: DensityOptions
 ) -> Tracks:
-    """Motion tracks and SIFT links with observations in images that are not registered."""
-    frames = image_set.images.frames
-    left = np.setdiff1d(frames, placed.frames)
-    if len(left) == 0:
+    """Motion tracks and SIFT links with observations in images that are not registered.
+
+    Args:
+        run: the run.
+        posed: the first model.
+        image_set: all images.
+        left: names of the images that are not registered.
+        density: which motion tracks are selected.
+    """
+    if not left:
         return Tracks.empty(posed.tracks.num_frames, (posed.tracks.width, posed.tracks.height))
+    frames, frame_of = image_set.images.frames, image_set.images.frame_of
     motion = select_tracks(pose_tracks(run, posed.tracks).keep_frames(frames), density)
     seen = Tracks.concatenate(motion, posed.links.keep_frames(frames))
-    touching = np.add.reduceat(np.isin(seen.frame, left), seen.offsets[:-1]) > 0
+    is_left = np.isin(seen.frame, [frame_of[name] for name in left])
+    touching = np.add.reduceat(is_left, seen.offsets[:-1]) > 0
     return seen.keep_tracks(touching)
+
+
+def _within_models(tracks: Tracks, models: Sequence[_Model], image_set: ImageSet) -> Tracks:
+    """Split tracks so that none connects two models.
+
+    Motion between two models is unreliable, and a mapper that followed it would bend. An image that
+    is not registered stays connected with the model of the registered image nearest in time.
+    """
+    frames = image_set.images.frames
+    model_of = np.full(len(frames), -1)
+    for number, model in enumerate(models):
+        model_of[np.searchsorted(frames, model.placed.frames)] = number
+    registered = np.flatnonzero(model_of >= 0)
+    distance = np.abs(np.arange(len(frames))[:, None] - registered)
+    model_of = model_of[registered[distance.argmin(axis=1)]]
+    of_observation = model_of[np.searchsorted(frames, tracks.frame)]
+    return Tracks.concatenate(
+        *(tracks.keep_observations(of_observation == number) for number in range(len(models)))
+    )
 
 
 def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.Camera]:
     """The camera of each image.
 
     Cameras of an existing database stay unchanged. If the focal length of a video changes, each of
-    its images has its own adjusted camera. Other cameras are adjusted if their focal length is
-    known, else they are the initial guess.
+    its images has its own adjusted camera. Other cameras are adjusted if their focal length was
+    estimated before or the model determines it, else they are the initial guess.
     """
     if run.cameras is not None:
         return run.cameras.of_images
@@ -399,6 +473,8 @@ def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.
     registered = {image.name: known.cameras[image.camera_id] for image in known.images}
     for camera in registered.values():
         camera.has_prior_focal_length = True  # models do not store it
+    is_guessed = not all(camera.has_prior_focal_length for camera in matched.values())
+    errors = focal_length_errors(known) if is_guessed else {}
     named = list(zip(image_set.sequence.tolist(), image_set.images.names, strict=True))
     of_sequence = {sequence: matched[name] for sequence, name in named if name in matched}
     initial = [of_sequence[sequence] for sequence, _ in named]
@@ -415,25 +491,43 @@ def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.
             nearest = adjusted[int(np.argmin(np.abs(places - i)))]
             cameras.append(nearest if name in registered else copy.copy(nearest))
         else:
-            is_known = adjusted and camera.has_prior_focal_length
+            is_known = adjusted and (
+                camera.has_prior_focal_length or errors[adjusted[0].camera_id] < _FOCAL_LENGTH_ERROR
+            )
             cameras.append(adjusted[0] if is_known else camera)
     return cameras
 
 
-def _focal_length(run: Run, camera: pycolmap.Camera, *, guessed: bool) -> float | None:
+def _focal_length(run: Run, camera: pycolmap.Camera) -> float | None:
     """The estimated focal length of the first video; None if it is given or assumed."""
     given = run.cameras is not None or run.options.match.camera.camera_params is not None
-    return None if given or guessed else float(camera.focal_length_y)
+    return None if given or not camera.has_prior_focal_length else float(camera.focal_length_y)
 
 
-def _warnings(posed: Posed, left: Sequence[str], num_images: int) -> list[str]:
-    """Warnings about the estimate."""
+def _warnings(models: Sequence[_Model], left: Sequence[str], num_images: int) -> list[str]:
+    """Warnings about the estimate.
+
+    Args:
+        models: the models.
+        left: names of the images that are not registered.
+        num_images: number of all images.
+    """
     warnings = []
+    if len(models) > 1:
+        parts = "; ".join(
+            f"{len(images)} from '{images[0].name}' to '{images[-1].name}'"
+            for images in (model.placed.images for model in models)
+        )
+        warnings.append(
+            f"hardly any points connect these parts, which are matched separately: {parts}; a "
+            "mapper makes a model of each, not always the largest first"
+        )
     if left:
         warnings.append(
             f"{len(left)} of {num_images} images are not registered in the joint estimate and are "
             f"matched by motion alone: {some_names(left)}"
         )
-    if posed.adjustment is not None and posed.adjustment.result.seams_warning is not None:
-        warnings.append(posed.adjustment.result.seams_warning)
+    adjustment = models[0].posed.adjustment
+    if adjustment is not None and adjustment.result.seams_warning is not None:
+        warnings.append(adjustment.result.seams_warning)
     return warnings

@@ -11,6 +11,7 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.initial_adjustment import KnownPoses
 from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
 from colmap_av1.matching.mapper_limits import INITIAL_MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
@@ -157,7 +158,9 @@ def test_camera_adjusted_far_off_after_many_iterations() -> None:
     matched = MatchedImages(keypoints, PAIR, [matches], [geometry], False)
     turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
     poses = [np.eye(3, 4), np.hstack([turn, np.array([[0], [0], [1]]) - turn[:, 2:]])]
-    (found,) = demote_bad_initial_pairs(matched, [camera] * 2, Clock(), poses).geometries
+    (found,) = demote_bad_initial_pairs(
+        matched, [camera] * 2, Clock(), KnownPoses([poses], True)
+    ).geometries
     assert len(geometry.inlier_matches) >= INITIAL_MIN_INLIERS > len(found.inlier_matches)
 
 
@@ -178,10 +181,35 @@ def test_pairs_with_few_inliers_if_no_pair_has_a_large_angle() -> None:
     matched = MatchedImages(
         keypoints, pairs, [g.inlier_matches for g in geometries], geometries, False
     )
-    found = demote_bad_initial_pairs(matched, [CAMERA] * 10, Clock(), poses).geometries
+    found = demote_bad_initial_pairs(
+        matched, [CAMERA] * 10, Clock(), KnownPoses([poses], True)
+    ).geometries
     assert found[0] is geometries[0]
     assert len(found[1].inlier_matches) == INITIAL_MIN_INLIERS // 2 - 1
     assert found[2] is geometries[2]
+
+
+def test_the_mapper_begins_with_the_first_model() -> None:
+    """A pair of another model has few inliers at a large angle, which the mapper tries first."""
+    rng = np.random.default_rng(0)
+    pairs = np.array([[0, 1], [2, 9]], dtype=np.int32)
+    nothing = np.empty((0, 2), np.float32)
+    keypoints = [ImageKeypoints(i, nothing, np.arange(0)) for i in range(10)]
+    models: list[list[NDArray[np.float64] | None]] = [[None] * 10, [None] * 10]
+    geometries = []
+    for model, (i, j), count, angle in zip(models, pairs, (400, 80), (12.0, 24.0), strict=True):
+        (keypoints[i], keypoints[j]), matches = two_views(4.0, rng, count, angle)
+        turn = Rotation.from_euler("y", -angle / 2, degrees=True).as_matrix()
+        model[i] = np.eye(3, 4)
+        model[j] = np.column_stack([turn, turn @ [-np.radians(angle), 0, 0]])
+        geometries.append(verified([keypoints[i], keypoints[j]], matches))
+    matched = MatchedImages(
+        keypoints, pairs, [g.inlier_matches for g in geometries], geometries, False
+    )
+    for known, expected in ((models, [True, False]), (models[::-1], [True, True])):
+        found = demote_bad_initial_pairs(matched, [CAMERA] * 10, Clock(), KnownPoses(known, True))
+        kept = [a is b for a, b in zip(found.geometries, geometries, strict=True)]
+        assert kept == expected
 
 
 def test_a_pair_whose_own_pose_is_wrong_is_demoted() -> None:
@@ -193,7 +221,9 @@ def test_a_pair_whose_own_pose_is_wrong_is_demoted() -> None:
     for angle, is_kept in ((0, True), (10, False)):
         wrong = Rotation.from_euler("y", angle, degrees=True).as_matrix()
         poses = [np.eye(3, 4), np.hstack([wrong @ turn, [[0], [0], [1]]])]
-        (found,) = demote_bad_initial_pairs(matched, [CAMERA] * 2, Clock(), poses).geometries
+        (found,) = demote_bad_initial_pairs(
+            matched, [CAMERA] * 2, Clock(), KnownPoses([poses], True)
+        ).geometries
         count = len(found.inlier_matches)
         assert (count == len(geometry.inlier_matches)) == is_kept
         assert count >= 40

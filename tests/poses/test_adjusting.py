@@ -8,10 +8,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pycolmap
 import pytest
 from dense_scene import OPTIONS, Truth
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import (
@@ -21,9 +23,9 @@ from colmap_av1.geometry.colmap_model import (
     read_model,
     take_points,
 )
-from colmap_av1.geometry.posed_model import posed_model, reprojection_errors
+from colmap_av1.geometry.posed_model import PosedModel, posed_model, reprojection_errors
 from colmap_av1.poses import adjusting
-from colmap_av1.poses.adjusting import adjust_posed, used_observations
+from colmap_av1.poses.adjusting import adjust_posed, focal_length_errors, used_observations
 from colmap_av1.reconstruct import ReconstructReport
 
 
@@ -74,6 +76,37 @@ def test_points_with_one_observation_are_dropped() -> None:
     assert index.tolist() == [0, 2]
     assert left.offsets.tolist() == [0, 2, 5]
     assert left.image.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_turns_determine_the_focal_length_and_a_straight_path_does_not() -> None:
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(-1, 1, (4000, 3)) * [8, 3, 40]
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 500.0, 640, 480)
+    errors = {}
+    for turn in (0.0, 6.0):  # degrees per image
+        images, seen = [], list[tuple[int, int, float, float]]()
+        for i in range(12):
+            rotation = Rotation.from_euler("y", turn * i, degrees=True).as_matrix()
+            pose = np.column_stack([rotation, rotation @ [0.1 * i, 0, -0.3 * i]])
+            images.append(ModelImage(i + 1, f"{i:02}.png", 1, pose))
+            x = xyz @ pose[:, :3].T + pose[:, 3]
+            xy = camera.img_from_cam(np.where(x[:, 2:] > 1, x, np.nan))
+            there = np.flatnonzero(((xy > 0) & (xy < [640, 480])).all(axis=1))
+            seen += [(k, i, *xy[k]) for k in there.tolist()]
+        rows = np.array(sorted(seen))
+        counts = np.bincount(rows[:, 0].astype(int), minlength=len(xyz))
+        points = ModelPoints(
+            xyz,
+            np.zeros((len(xyz), 3), np.uint8),
+            np.zeros(len(xyz)),
+            np.cumsum([0, *counts]),
+            rows[:, 1].astype(np.int64),
+            rows[:, 2:],
+        )
+        several = keep_observations(points, np.repeat(counts >= 3, counts))[0]
+        errors[turn] = focal_length_errors(PosedModel({1: camera}, images, several))[1]
+    assert errors[6.0] < 0.005
+    assert errors[0.0] > 0.1  # infinite, but for rounding
 
 
 def test_half_of_the_observations_determine_the_poses(

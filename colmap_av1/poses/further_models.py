@@ -1,0 +1,174 @@
+"""The poses of models that are not connected with the first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from colmap_av1.errors import ModelError, cannot_write
+from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
+from colmap_av1.images.image_set import ImageSet
+from colmap_av1.poses.estimate import Posed, refined_poses, split_at_seams, trusted_tracks
+from colmap_av1.poses.parts import FEWEST_IMAGES
+from colmap_av1.poses.pose_stages import MappedResult
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import LEAST_IMAGES
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.files import remove_leftovers
+from colmap_av1.util.stages import Kept, remove_products, run_stage
+
+# Folders of further models, each followed by its number.
+_FOLDER = "model_"
+
+
+@dataclass(frozen=True)
+class FurtherPoses:
+    """The poses of a further model.
+
+    Attributes:
+        run: its run, with a separate output folder.
+        posed: its stages.
+        image_set: its registered images that no earlier model has.
+    """
+
+    run: Run
+    posed: Posed
+    image_set: ImageSet
+
+
+def further_poses(
+    run: Run, first: Posed, image_set: ImageSet, read_tracks: Callable[[], Sequence[Tracks]]
+) -> Iterator[FurtherPoses]:
+    """Yield the poses of the models that are not connected with the first.
+
+    The mapper may register an image in several models. It belongs to the first of these only,
+    because trainers that search the whole output folder would confuse images and masks of different
+    models.
+
+    Args:
+        run: the run.
+        first: the stages of the first model.
+        image_set: all images.
+        read_tracks: reads the tracks of each video. They are large, so they are not kept between
+            the models.
+    """
+    left = set(image_set.images.names) - _registered(run, first)
+    keyed = image_set.some(first.matches.result.key_images)
+    waiting = _other_models(run, first)
+    number = 1
+    while waiting:
+        mapped = waiting.pop(0)
+        known = set(mapped.model.by_name)
+        if len(known & left) < LEAST_IMAGES:  # The mapper registered these images twice.
+            continue
+        own = _run_of_model(run, number)
+        own_poses = _poses_of_model(run, own, first, mapped)
+        free = left.difference(*(other.model.by_name for other in waiting))
+        some, key = _named(image_set, known | free), _named(keyed, known)
+        try:
+            posed = refined_poses(
+                own,
+                first.matches,
+                own_poses,
+                trusted=trusted_tracks(run, read_tracks(), image_set),
+                image_set=some,
+                keyed=key,
+                has_picture_positions=first.has_picture_positions,
+            )
+            posed = split_at_seams(own, posed, some)
+        except ModelError:  # no track agrees with the mapper's poses of these images
+            continue
+        waiting += _other_models(own, posed)
+        new = _registered(own, posed) & left
+        if len(new) < FEWEST_IMAGES:
+            continue
+        left -= new
+        number += 1
+        yield FurtherPoses(own, posed, _named(image_set, new))
+    _remove_further_models(run, number)
+
+
+@dataclass(frozen=True)
+class _MappedModel:
+    """A further model of a mapping or a split.
+
+    Attributes:
+        digest: digest of the stage that made it.
+        file: its file among the products of that stage.
+        model: its poses.
+    """
+
+    digest: str
+    file: str
+    model: PosedModel
+
+
+def _other_models(run: Run, posed: Posed) -> list[_MappedModel]:
+    return [
+        _MappedModel(posed.mapped.digest, file, read_posed_model(run.stages / file))
+        for file in posed.mapped.result.other_models
+    ]
+
+
+def _registered(run: Run, posed: Posed) -> set[str]:
+    """The names of the registered images."""
+    return set(read_posed_model(run.stages / posed.last.result.poses).by_name)
+
+
+def _named(image_set: ImageSet, names: AbstractSet[str]) -> ImageSet:
+    """The images with the given names."""
+    return image_set.some([i for i, name in enumerate(image_set.images.names) if name in names])
+
+
+def _run_of_model(run: Run, number: int) -> Run:
+    """The run of a further model, with a separate output folder."""
+    output = run.output / f"{_FOLDER}{number}"
+    own = replace(run, output=output, stages=output / run.stages.name)
+    try:
+        own.stages.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ModelError(cannot_write(output, error)) from error
+    for folder in (own.output, own.stages):
+        remove_leftovers(folder)
+    return own
+
+
+def _poses_of_model(run: Run, own: Run, first: Posed, mapped: _MappedModel) -> Kept[MappedResult]:
+    """Write the poses of a further model to its stages.
+
+    A few images do not determine a camera well, so that cameras of the first model are used if it
+    has them.
+
+    Args:
+        run: the run of the first model.
+        own: the run of the further model, see `_run_of_model`.
+        first: the first model.
+        mapped: the further model.
+    """
+
+    def make(partial: Path) -> MappedResult:
+        known = read_posed_model(run.stages / first.last.result.poses).cameras
+        model = mapped.model
+        cameras = {i: known.get(i, camera) for i, camera in model.cameras.items()}
+        write_posed_model(partial / "mapped.npz", PosedModel(cameras, model.images))
+        return MappedResult("mapped.npz", len(model.images), {}, first.mapped.result.mapper, ())
+
+    return run_stage(
+        own.stages,
+        "poses",
+        [mapped.digest, first.last.digest, mapped.file],
+        MappedResult,
+        into=own.stages,
+        products=["mapped.npz"],
+        make=make,
+    )
+
+
+def _remove_further_models(run: Run, first: int) -> None:
+    """Remove further models of an earlier run whose number is `first` or higher."""
+    for folder in run.output.glob(f"{_FOLDER}*"):
+        number = folder.name.removeprefix(_FOLDER)
+        if number.isdecimal() and int(number) >= first and (folder / run.stages.name).is_dir():
+            remove_products(folder, folder / run.stages.name)
