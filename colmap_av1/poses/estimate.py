@@ -252,20 +252,20 @@ def trusted_tracks(
 
 
 def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
-    """Map the adjusted observations again, and use the result if that lowers the cost.
+    """Map the adjusted observations again, and use the result unless that raises the cost.
 
-    See `remapping`. A third mapping never lowered the cost further. Nothing is mapped again if
-    links replace no motion, if the adjusted model holds together well, or if the adjustment did not
-    use corners.
+    See `remapping`. Nothing is mapped again if links replace no motion, if the adjusted model holds
+    together well, or if the adjustment did not use corners.
     """
     if posed.adjustment is None or not posed.has_picture_positions:
         return posed
     links, adjusted = posed.matches.result.links, posed.adjustment.result
     if not (links.gaps or links.fast) or not (adjusted.doubtful_seams or adjusted.turns):
         return posed
-    again = remap_stage(run, image_set, posed.adjustment)
-    if not again.result.is_better:
+    again = remap_stage(run, image_set, posed.mapped, posed.adjustment)
+    if not again.result.is_used:
         return posed
+    posed = replace(posed, mapped=again)
     return replace(posed, adjustment=_adjusted(run, posed, image_set, again, number=2))
 
 
