@@ -77,9 +77,8 @@ class MatchReport:
         track_lengths: quantiles of the number of images that observe a track, from 0 (shortest)
             to 1 (longest); empty without tracks.
         num_observations: keypoints of all images.
-        focal_length: focal length of the first video in pixel heights, if it was estimated from
-            the tracks; None if it was given, or if it is not observable and the camera has
-            COLMAP's default.
+        focal_length: focal length of the first video in pixel heights, if it was estimated; None if
+            it was given, or if it is not observable and the camera has COLMAP's default.
         read_outs: rolling-shutter read-out time of each video in milliseconds, from the first row
             to the last; None if the keypoints were not corrected for it.
         num_pairs: image pairs written.
@@ -244,10 +243,10 @@ def match(
         )
         cameras = _listed_cameras(database, listed, images) if listed else None
         found = _match_images(images, cameras, scratch, options, context)
-        known = None
+        known = KnownPoses()
         if isinstance(found, JointMatches):
-            is_known = all(camera.has_prior_focal_length for camera in found.cameras)
-            known = KnownPoses(found.poses, are_comparable=is_known)
+            has_focal_lengths = all(camera.has_prior_focal_length for camera in found.cameras)
+            known = KnownPoses(found.poses, are_comparable=has_focal_lengths)
         written = demote_bad_initial_pairs(found.matched, found.cameras, clock, known)
         num_written, blurred = 0, list[str]()
         if folder is not None:

@@ -59,7 +59,7 @@ def match_rows(report: MatchReport) -> Rows:
     if report.estimate is not None:
         rows += _estimate_rows(report.estimate, report.num_images)
     elif report.focal_length is not None:
-        rows.append(("focal length", f"{report.focal_length:.1f} px, estimated from the tracks"))
+        rows.append(("focal length", f"{report.focal_length:.1f} px, estimated"))
     if report.forward_motion:
         rows.append(("motion", "forward: the mapper needs the options below, and known intrinsics"))
     return [*rows, *_seconds_rows(report.seconds)]

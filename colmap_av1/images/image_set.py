@@ -174,9 +174,9 @@ def pictures_of(
     """A function that yields the pictures of images.
 
     Args:
-        image_set: the images.
+        image_set: the images, of some frames and some photos.
         videos: the videos.
-        photos: the files of the photos.
+        photos: the files of all photos.
         options: how videos are decoded.
 
     Returns:
@@ -200,9 +200,9 @@ def pictures_of(
                 )
                 for frame, picture in decoded:
                     yield image_of[frame], picture
-        first_photo = len(image_set.sequence) - len(photos)
-        for index, photo in enumerate(photos, start=first_photo):
-            if index in left:
-                yield index, read_image(photo)
+        for number, photo in enumerate(photos, start=len(videos)):
+            for index in image_set.images_of(number):
+                if index in left:
+                    yield index, read_image(photo)
 
     return pictures

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,10 @@ class ImagePositions:
         """Digest of the positions and directions of gravity."""
         arrays = self.places.tobytes() + self.gravity.tobytes()
         return hashlib.sha256(arrays + repr(self.place).encode()).hexdigest()
+
+    def some(self, index: NDArray[np.int64]) -> ImagePositions:
+        """Select images by their indices."""
+        return replace(self, places=self.places[index], gravity=self.gravity[index])
 
 
 def image_positions(

@@ -147,8 +147,8 @@ class KnownPoses:
     Attributes:
         models: for each model, float64 [3, 4] cam_from_world of each image, None if it is not in
             the model. The relative pose of images in different models is not known.
-        are_comparable: whether the poses of pairs can be compared with these. They are wrong if the
-            focal length of the images is a guess.
+        are_comparable: whether to compare the poses of pairs with these. The poses of pairs are
+            wrong if a focal length is a guess.
     """
 
     models: Sequence[Sequence[_Floats | None]] = ()
@@ -215,8 +215,9 @@ def bad_initial_pairs(
     up to the first pair that the mapper certainly accepts and that is stable. If there is no such
     pair, they are tried again with the mapper's lower limits.
 
-    Trainers open the model that the mapper makes first, which should be the first known model. So
-    the limits are lowered until the mapper certainly accepts one of its pairs.
+    Trainers open the model that the mapper writes first, so it should begin with the first known
+    model. If that has no pair that meets the mapper's first limits, pairs of other models with few
+    inliers are bad. Their pairs with many inliers are not, so the mapper may still begin with them.
 
     Args:
         matched: the images.
@@ -225,10 +226,10 @@ def bad_initial_pairs(
         misleading: triangulation angle in degrees of pairs whose pose is wrong, by index.
 
     Returns:
-        Indices of pairs. Pairs that diverge are not among them if no poses are known and no tried
-        pair is stable, as no other pair would then be a better start. If poses are known and no
-        pair meets the mapper's first limits, all pairs with few inliers are among them, except
-        those that are certainly stable.
+        Indices of pairs. Pairs that diverge are not among them if no poses are comparable and no
+        tried pair is stable, as no other pair would then be a better start. If poses are comparable
+        and no pair meets the mapper's first limits, all pairs with few inliers are among them,
+        except those of the first model that are certainly stable.
     """
     counts = np.array([len(own.inlier_matches) for own in matched.geometries], dtype=np.intp)
     bad, sure = set[int](), set[int]()
@@ -242,7 +243,11 @@ def bad_initial_pairs(
         starts = _starts(matched, cameras, known, limits=limits, left_out=bad)
         if known.are_comparable or any(start.is_stable for start in starts.values()):
             bad |= {k for k, start in starts.items() if not start.is_stable}
-        sure = {k for k, start in starts.items() if start.is_sure}
+        sure = {
+            k
+            for k, start in starts.items()
+            if start.is_sure and known.in_first(matched.pairs[k].tolist())
+        }
         if sure:
             break
     if known.are_comparable and limits != _LIMITS[0]:
@@ -280,7 +285,7 @@ def _starts(
                 starts[k] = _try_start(matched, cameras, pair, geometry, known, limits=limits)
             start = starts[k]
             if start is not None and start.is_sure:
-                is_sure = True
+                is_sure |= known.in_first(matched.pairs[k].tolist())
                 break
     return {k: start for k, start in starts.items() if start is not None}
 
@@ -308,17 +313,15 @@ class _Start:
     Attributes:
         is_stable: bundle adjustment keeps the intrinsics near their initial values.
         is_certain: the mapper accepts the pair with any seed.
-        is_first: the pair belongs to the first known model.
     """
 
     is_stable: bool
     is_certain: bool
-    is_first: bool
 
     @property
     def is_sure(self) -> bool:
-        """Whether the mapper accepts the pair with any seed, and makes the first known model."""
-        return self.is_stable and self.is_certain and self.is_first
+        """Whether the mapper accepts the pair with any seed, and its model does not diverge."""
+        return self.is_stable and self.is_certain
 
 
 def _try_start(
@@ -343,7 +346,6 @@ def _try_start(
     if not _is_wide(pose, angle / min_angle, _QUICK_SHARE):
         return None
     inliers = inliers_of(matched, cameras, pair, geometry)
-    unstable = _Start(is_stable=False, is_certain=False, is_first=known.in_first(pair))
     rotations, certain = list[_Floats](), list[bool]()
     for rows, pose, angle in _poses(inliers):
         # A pose just below the limits is tried, too: with another seed the mapper may accept it.
@@ -352,21 +354,20 @@ def _try_start(
             continue
         rotation = pose[:, :3]
         if known.contradict(pair, rotation, angle):
-            return unstable
+            return _Start(is_stable=False, is_certain=False)
         # Adjustment from nearly the same pose has the same result, so it is not repeated.
         if all(_angle_between(own, rotation) > _SAME * angle for own in rotations):
             is_stable = _is_stable(inliers, rows, pose, min_angle)
             if is_stable is None:
                 continue
             if not is_stable:
-                return unstable
+                return _Start(is_stable=False, is_certain=False)
         rotations.append(rotation)
         enough = len(rows) >= _MARGIN * min_inliers
         certain.append(enough and _is_wide(pose, share, _MARGIN))
     if not certain:
         return None
-    is_certain = len(certain) >= _NUM_SEEDS and all(certain)
-    return replace(unstable, is_stable=True, is_certain=is_certain)
+    return _Start(True, len(certain) >= _NUM_SEEDS and all(certain))
 
 
 def _some_inliers(

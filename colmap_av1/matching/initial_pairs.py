@@ -35,6 +35,7 @@ _MIN_INLIERS = INITIAL_MIN_INLIERS // 2
 # twenty times. If the pose is right, the angles differ by less than a third.
 _ANGLE_FACTOR = 1.5
 _ERROR_FACTOR = 1.5
+_NONE_KNOWN = KnownPoses()
 # The error of a pose is this quantile of its matches' errors.
 _ERROR_QUANTILE = 0.9
 
@@ -43,7 +44,7 @@ def demote_bad_initial_pairs(
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
     clock: Clock,
-    known: KnownPoses | None = None,
+    known: KnownPoses = _NONE_KNOWN,
 ) -> MatchedImages:
     """Limit the inliers of pairs that would make a bad initial pair.
 
@@ -63,7 +64,6 @@ def demote_bad_initial_pairs(
     """
     geometries = list(matched.geometries)
     with clock.measure("verification"):
-        known = known if known is not None else KnownPoses()
         misleading = known.misleading_pairs(matched, cameras)
         for k, (pair, geometry) in enumerate(zip(matched.pairs.tolist(), geometries, strict=True)):
             if _may_start(geometry):

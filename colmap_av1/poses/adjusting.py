@@ -8,7 +8,6 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -26,6 +25,7 @@ from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.options import ReconstructOptions
 from colmap_av1.poses.mapper import ADJUSTMENT_STEPS, ADJUSTMENT_TOLERANCE, adjust_model
 from colmap_av1.poses.run import Run
+from colmap_av1.util.spread import evenly_spread
 
 # Scales of the robust loss in pixels. Half of the observations have errors below 0.3 to 0.4 px;
 # larger ones have drifted. The first adjustment has a larger scale: the mapper may leave images
@@ -38,9 +38,9 @@ LOSS_SCALES = (1.0, 0.25)
 OBSERVATIONS = 400
 # Points with more observations keep at least this many.
 _FEWEST_KEPT = 8
-# The covariance of intrinsics is estimated from this number of observations per image, with this
-# standard deviation in pixels.
-_OBSERVATIONS_OF_ERRORS, _ERROR = 100, 0.25
+# The covariance of intrinsics is estimated from at most this number of images and about this number
+# of observations of each, whose standard deviation in pixels is assumed.
+_COVARIANCE_IMAGES, _COVARIANCE_OBSERVATIONS, _OBSERVATION_ERROR = 200, 100, 0.25
 # Step of the phase in which consecutive points keep observations: the fractional part of the golden
 # ratio. Points that are observed in the same images then keep different ones.
 _PHASE_STEP = (5**0.5 - 1) / 2
@@ -128,21 +128,28 @@ def adjust_posed(
 
 
 def focal_length_errors(model: PosedModel) -> dict[int, float]:
-    """Relative standard deviation of the focal length of each camera, by camera id.
+    """Estimate the relative standard deviation of each camera's focal length.
 
-    It follows from the covariance of a bundle adjustment of poses, points and intrinsics, in which
-    the errors of observations are independent.
+    It is computed from the covariance of all parameters of a bundle adjustment. Errors of
+    observations are assumed independent, so the true error may be several times as large.
 
     Args:
-        model: an adjusted model, with points. About 100 observations per image are used.
+        model: an adjusted model, with points. Of large models, a selection is used.
 
     Returns:
-        Infinite for cameras whose focal length is not determined.
+        The relative standard deviation by camera id; infinite if the focal length is not
+        determined.
     """
-    used = used_observations(model.points, len(model.images), _OBSERVATIONS_OF_ERRORS)
-    points, _ = keep_observations(model.points, used)
+    num_images = len(model.images)
+    some = np.array(evenly_spread(num_images, min(num_images, _COVARIANCE_IMAGES)))
+    place = np.full(num_images, -1)
+    place[some] = np.arange(len(some))
+    points, _ = keep_observations(model.points, place[model.points.image] >= 0)
+    points = replace(points, image=place[points.image])
+    used = used_observations(points, len(some), _COVARIANCE_OBSERVATIONS)
+    points, _ = keep_observations(points, used)
     with tempfile.TemporaryDirectory() as folder:
-        write_model(Path(folder), model.cameras, model.images, points)
+        write_model(Path(folder), model.cameras, [model.images[i] for i in some], points)
         found = read_model(Path(folder))
     config = pycolmap.BundleAdjustmentConfig()
     for image in found.reg_image_ids():
@@ -150,19 +157,15 @@ def focal_length_errors(model: PosedModel) -> dict[int, float]:
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    holder: Any = getattr(options, "ceres", options)  # the options themselves before COLMAP 4
-    holder.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    holder.loss_function_scale = LOSS_SCALES[-1]
-    create: Any = getattr(
-        pycolmap,
-        "create_default_ceres_bundle_adjuster",
-        pycolmap.create_default_bundle_adjuster,  # before COLMAP 4
-    )
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = LOSS_SCALES[-1]
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # no warning about infinite ones
+    # COLMAP warns if the covariance cannot be computed.
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     try:
         covariance = pycolmap.estimate_ba_covariance(
-            pycolmap.BACovarianceOptions(), found, create(options, config, found)
+            pycolmap.BACovarianceOptions(), found, adjuster
         )
     finally:
         pycolmap.logging.minloglevel = level
@@ -171,7 +174,7 @@ def focal_length_errors(model: PosedModel) -> dict[int, float]:
         own = covariance.get_other_params_cov(camera.params) if covariance is not None else None
         if own is not None:
             at = camera.focal_length_idxs()[0]
-            errors[number] = _ERROR * math.sqrt(own[at, at]) / camera.params[at]
+            errors[number] = _OBSERVATION_ERROR * math.sqrt(own[at, at]) / camera.params[at]
     return errors
 
 

@@ -46,7 +46,8 @@ class Posed:
 
     Attributes:
         matches: the database of the key images, see `match_stage`; that of the first model.
-        mapped: the poses of the key images, see `pose_stage`.
+        mapped: the poses of the key images, see `pose_stage`; after a second mapping or a split,
+            those of all its images.
         resection: the poses of the images in between; None if all images are key images.
         dynamic: the dynamic objects; None if they were not looked for.
         adjustment: the adjusted poses; None if they are not adjusted.
@@ -252,7 +253,7 @@ def trusted_tracks(
 
 
 def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
-    """Map the adjusted observations again, and use the result unless that raises the cost.
+    """Map the images again from the adjusted observations, and use that unless its cost is higher.
 
     See `remapping`. Nothing is mapped again if links replace no motion, if the adjusted model holds
     together well, or if the adjustment did not use corners.

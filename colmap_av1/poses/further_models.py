@@ -1,4 +1,4 @@
-"""The poses of models that are not connected with the first."""
+"""The poses of models that are not connected to the first."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class FurtherPoses:
     Attributes:
         run: its run, with a separate output folder.
         posed: its stages.
-        image_set: its registered images that no earlier model has.
+        image_set: the images that no earlier model has; some of them are registered.
     """
 
     run: Run
@@ -41,7 +41,7 @@ class FurtherPoses:
 def further_poses(
     run: Run, first: Posed, image_set: ImageSet, read_tracks: Callable[[], Sequence[Tracks]]
 ) -> Iterator[FurtherPoses]:
-    """Yield the poses of the models that are not connected with the first.
+    """Yield the poses of the models that are not connected to the first.
 
     The mapper may register an image in several models. It belongs to the first of these only,
     because trainers that search the whole output folder would confuse images and masks of different
@@ -55,18 +55,17 @@ def further_poses(
             the models.
     """
     left = set(image_set.images.names) - _registered(run, first)
-    keyed = image_set.some(first.matches.result.key_images)
     waiting = _other_models(run, first)
     number = 1
     while waiting:
         mapped = waiting.pop(0)
         known = set(mapped.model.by_name)
-        if len(known & left) < LEAST_IMAGES:  # The mapper registered these images twice.
+        if len(known & left) < LEAST_IMAGES:  # nearly all of its images are in an earlier model
             continue
         own = _run_of_model(run, number)
         own_poses = _poses_of_model(run, own, first, mapped)
         free = left.difference(*(other.model.by_name for other in waiting))
-        some, key = _named(image_set, known | free), _named(keyed, known)
+        some = _named(image_set, known | free)
         try:
             posed = refined_poses(
                 own,
@@ -74,19 +73,19 @@ def further_poses(
                 own_poses,
                 trusted=trusted_tracks(run, read_tracks(), image_set),
                 image_set=some,
-                keyed=key,
+                keyed=_named(image_set, known),
                 has_picture_positions=first.has_picture_positions,
             )
             posed = split_at_seams(own, posed, some)
-        except ModelError:  # no track agrees with the mapper's poses of these images
+        except ModelError:  # too few tracks agree with these poses
             continue
         waiting += _other_models(own, posed)
         new = _registered(own, posed) & left
         if len(new) < FEWEST_IMAGES:
             continue
-        left -= new
         number += 1
-        yield FurtherPoses(own, posed, _named(image_set, new))
+        yield FurtherPoses(own, posed, _named(image_set, left))
+        left -= new
     _remove_further_models(run, number)
 
 
@@ -138,7 +137,7 @@ def _run_of_model(run: Run, number: int) -> Run:
 def _poses_of_model(run: Run, own: Run, first: Posed, mapped: _MappedModel) -> Kept[MappedResult]:
     """Write the poses of a further model to its stages.
 
-    A few images do not determine a camera well, so that cameras of the first model are used if it
+    A few images do not determine a camera well, so the cameras of the first model are used where it
     has them.
 
     Args:

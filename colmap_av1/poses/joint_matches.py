@@ -10,6 +10,7 @@ observations suffice. This keeps the mapper fast.
 from __future__ import annotations
 
 import copy
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,9 +30,10 @@ from colmap_av1.matching.image_matches import PairedImages, verify_images
 from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
-from colmap_av1.poses.adjusting import focal_length_errors
+from colmap_av1.poses.adjusting import focal_length_errors, refines_intrinsics
 from colmap_av1.poses.estimate import Posed, estimate_poses
 from colmap_av1.poses.further_models import further_poses
+from colmap_av1.poses.pose_stages import AdjustedResult
 from colmap_av1.poses.posed_images import PosedImages, posed_images_of, triangulate_in
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.starting_pair import StartingPair, starting_pair
@@ -70,10 +72,10 @@ _NUM_SAMPLED = 5
 _SAME_POINT = 1.0
 # Two tracks of one video this close to each other, in pixels, are the same.
 _SAME_TRACK = 0.01
-# Largest relative standard deviation of a focal length that the adjustment determines. On walks
-# with turns it is 0.5 %, and the focal length is off by 0.1 to 0.3 %. On a straight drive they
-# are 1.3 and 7 %. COLMAP's mapper registers all images of the drive then; with the initial guess it
-# registers 5 of 51.
+# A focal length is determined if its relative standard deviation is below this. On walks with turns
+# the standard deviation is 0.5 % and the true error 0.1 to 0.3 %; on a straight drive they are 1.3
+# and 7 %. With the adjusted focal length, COLMAP's mapper registers all images of the drive; with
+# the initial guess, 5 of 51.
 _FOCAL_LENGTH_ERROR = 0.03
 # Largest number of matches of the initial pair.
 _MAX_INITIAL_MATCHES = 300
@@ -84,8 +86,8 @@ class JointEstimate:
     """Results of the joint estimate of all poses.
 
     Attributes:
-        num_registered: number of registered images of each model. Models are not connected; the
-            figures below are of the first.
+        num_registered: number of registered images of each model, the largest first. The other
+            figures describe the first model.
         far_views: median long-range epipolar error in pixels, over pairs of images ten or more
             apart; None if no such images overlap.
         far_views_largest: its 90th percentile.
@@ -106,8 +108,8 @@ class JointMatches(ImageMatches):
 
     Attributes:
         estimate: results of the estimate.
-        poses: for each model, float64 [3, 4] cam_from_world of each image; None for images of other
-            models.
+        poses: for each model, float64 [3, 4] cam_from_world of each image; None if the image is not
+            in the model.
     """
 
     estimate: JointEstimate
@@ -140,10 +142,10 @@ def match_jointly(
     far = posed.far_views.result if posed.far_views is not None else None
     if far is not None and far.apart:
         raise ModelError("images far apart in time contradict the poses")
-    first = _model_of(run, posed, image_set)
-    models = [first]
+    models = [_model_of(run, posed, image_set)]
     for own in further_poses(run, posed, image_set, lambda: [v.tracks for v in videos]):
         models.append(_model_of(own.run, own.posed, own.image_set))
+    models.sort(key=lambda model: -len(model.placed.images))
     registered = {image.name for model in models for image in model.placed.images}
     left = [name for name in image_set.images.names if name not in registered]
     with run.clock.measure("pairs"):
@@ -151,10 +153,10 @@ def match_jointly(
         others = _within_models(others, models, image_set)
         agreeing = [_agreeing_tracks(model, image_set, others, density) for model in models]
         paired = _paired(run, image_set, agreeing, others, density)
-    cameras = _cameras(run, image_set, first.known)
+    cameras = _cameras(run, image_set, models)
     matched = verify_images(paired, cameras, run.options.match.verify, run.context)
     matches = posed.matches.result
-    focal = [camera.mean_focal_length() for camera in first.placed.camera_of_image]
+    focal = [camera.mean_focal_length() for camera in models[0].placed.camera_of_image]
     return JointMatches(
         cameras=cameras,
         focal_length=_focal_length(run, cameras[0]),
@@ -181,26 +183,31 @@ class _Model:
 
     Attributes:
         run: its run.
-        posed: its stages.
+        adjusted: its adjustment.
         known: its poses and points.
         placed: its registered images, except those of an earlier model.
+        tracks: the tracks that poses are estimated from, in these images.
     """
 
     run: Run
-    posed: Posed
+    adjusted: AdjustedResult
     known: PosedModel
     placed: PosedImages
+    tracks: Tracks
 
     def poses_of(self, image_set: ImageSet) -> list[NDArray[np.float64] | None]:
-        """float64 [3, 4] cam_from_world of each image; None for images of other models."""
+        """float64 [3, 4] cam_from_world of each image; None if it is not in the model."""
         pose_of = {image.name: image.cam_from_world for image in self.placed.images}
         return [pose_of.get(name) for name in image_set.images.names]
 
 
 def _model_of(run: Run, posed: Posed, image_set: ImageSet) -> _Model:
     """The finished model of a run, with those of its images that are in the set."""
+    assert posed.adjustment is not None  # `match` always adjusts
     known = read_posed_model(run.stages / posed.last.result.poses)
-    return _Model(run, posed, known, posed_images_of(known, image_set))
+    placed = posed_images_of(known, image_set)
+    tracks = pose_tracks(run, posed.tracks).keep_frames(placed.frames)
+    return _Model(run, posed.adjustment.result, known, placed, tracks)
 
 
 @dataclass(frozen=True)
@@ -231,11 +238,11 @@ def _agreeing_tracks(
         others: tracks with observations in images that are not registered.
         density: which motion tracks are selected.
     """
-    run, posed, placed = model.run, model.posed, model.placed
+    run, placed = model.run, model.placed
     corners, corner_points = _agreeing_corners(model, image_set)
     repeated = at_same_place(corners, others, _SAME_TRACK)
     corners, corner_points = corners.keep_tracks(~repeated), corner_points[~repeated]
-    every = pose_tracks(run, posed.tracks).keep_frames(placed.frames)
+    every = model.tracks
     every = every.keep_tracks(~at_same_place(every, others, _SAME_TRACK))
     # `_kept_observations` applies the limit per image, which depends on what each track keeps.
     some = select_tracks(every, replace(density, max_tracks_per_image=0))
@@ -259,13 +266,12 @@ def _agreeing_tracks(
 
 def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, NDArray[np.float64]]:
     """The corners and SIFT links used in the adjustment, without outliers, and their points."""
-    known, adjustment = model.known, model.posed.adjustment
-    assert adjustment is not None  # `match` always adjusts
+    known = model.known
     errors = reprojection_errors(known)
     adjusted = tracks_of_model(known, image_set)
     agrees = errors <= max(_LEAST_ERROR, _MEDIAN_ERRORS * float(np.median(errors)))
     # Points of motion tracks come first.
-    agrees &= adjusted.track >= adjustment.result.num_motion_points
+    agrees &= adjusted.track >= model.adjusted.num_motion_points
     agrees &= np.isin(adjusted.frame, model.placed.frames)
     enough = np.bincount(adjusted.track[agrees], minlength=adjusted.num_tracks) >= _NUM_KEPT
     kept = adjusted.keep_observations(agrees & enough[adjusted.track])
@@ -440,28 +446,41 @@ def _tracks_of_unregistered(
 def _within_models(tracks: Tracks, models: Sequence[_Model], image_set: ImageSet) -> Tracks:
     """Split tracks so that none connects two models.
 
-    Motion between two models is unreliable, and a mapper that followed it would bend. An image that
-    is not registered stays connected with the model of the registered image nearest in time.
+    Motion between two models is unreliable. If it were matched, a mapper would join the models at a
+    wrong place. An image that is not registered stays connected to the model of the nearest
+    registered image of its video. Images of videos that have none, and photos, stay connected to
+    the model that they share the most tracks with.
     """
+    if len(models) == 1 or tracks.num_tracks == 0:
+        return tracks
     frames = image_set.images.frames
     model_of = np.full(len(frames), -1)
     for number, model in enumerate(models):
         model_of[np.searchsorted(frames, model.placed.frames)] = number
-    registered = np.flatnonzero(model_of >= 0)
-    distance = np.abs(np.arange(len(frames))[:, None] - registered)
-    model_of = model_of[registered[distance.argmin(axis=1)]]
-    of_observation = model_of[np.searchsorted(frames, tracks.frame)]
+    image = np.searchsorted(frames, tracks.frame)
+    for sequence in np.unique(image_set.sequence):
+        own = np.flatnonzero(image_set.sequence == sequence)
+        registered = own[model_of[own] >= 0]
+        if len(registered):
+            nearest = np.searchsorted((registered[1:] + registered[:-1]) / 2, own)
+            model_of[own] = model_of[registered[nearest]]
+        else:
+            touching = np.isin(tracks.track, tracks.track[np.isin(image, own)])
+            shared = model_of[image[touching]]
+            model_of[own] = np.bincount(shared[shared >= 0], minlength=1).argmax()
+    of_observation = model_of[image]
     return Tracks.concatenate(
         *(tracks.keep_observations(of_observation == number) for number in range(len(models)))
     )
 
 
-def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.Camera]:
+def _cameras(run: Run, image_set: ImageSet, models: Sequence[_Model]) -> list[pycolmap.Camera]:
     """The camera of each image.
 
     Cameras of an existing database stay unchanged. If the focal length of a video changes, each of
-    its images has its own adjusted camera. Other cameras are adjusted if their focal length was
-    estimated before or the model determines it, else they are the initial guess.
+    its images has its own adjusted camera. Otherwise the images of a video have the adjusted camera
+    of its largest model, if the focal length was estimated from tracks or the model determines it;
+    if not, the initial guess.
     """
     if run.cameras is not None:
         return run.cameras.of_images
@@ -470,31 +489,41 @@ def _cameras(run: Run, image_set: ImageSet, known: PosedModel) -> list[pycolmap.
     matched = dict(
         zip(names, listed_cameras(run.output / "database.db", listed, names), strict=True)
     )
-    registered = {image.name: known.cameras[image.camera_id] for image in known.images}
-    for camera in registered.values():
-        camera.has_prior_focal_length = True  # models do not store it
-    is_guessed = not all(camera.has_prior_focal_length for camera in matched.values())
-    errors = focal_length_errors(known) if is_guessed else {}
     named = list(zip(image_set.sequence.tolist(), image_set.images.names, strict=True))
     of_sequence = {sequence: matched[name] for sequence, name in named if name in matched}
     initial = [of_sequence[sequence] for sequence, _ in named]
-    # Images share a camera if it is the same object, see `ImageMatches`.
-    sharing = defaultdict[int, list[int]](list)
-    for i, (_, name) in enumerate(named):
-        if name in registered:
-            sharing[id(initial[i])].append(i)
+    # Images share a camera if it is the same object, see `ImageMatches`. The adjusted cameras of
+    # the images that share each, in the first model that has any of them.
+    sharing: dict[int, dict[int, pycolmap.Camera]] = {}
+    determined = dict[int, bool]()
+    for model in models:
+        own = defaultdict[int, dict[int, pycolmap.Camera]](dict)
+        in_model = {image.name: image.camera_id for image in model.placed.images}
+        for i, (_, name) in enumerate(named):
+            if name in in_model and id(initial[i]) not in sharing:
+                own[id(initial[i])][i] = model.known.cameras[in_model[name]]
+        sharing |= own
+        guessed = any(
+            not initial[i].has_prior_focal_length for images in own.values() for i in images
+        )
+        errors = {}
+        if guessed and refines_intrinsics(run.options):
+            with run.clock.measure("adjustment"):
+                errors = focal_length_errors(model.known)
+        for number, camera in model.known.cameras.items():
+            camera.has_prior_focal_length = True  # models do not store it
+            determined[id(camera)] = errors.get(number, math.inf) < _FOCAL_LENGTH_ERROR
     cameras = []
-    for i, (camera, (_, name)) in enumerate(zip(initial, named, strict=True)):
-        places = np.array(sharing[id(camera)])
-        adjusted = [registered[named[k][1]] for k in places]
-        if len(set(map(id, adjusted))) > 1:
-            nearest = adjusted[int(np.argmin(np.abs(places - i)))]
-            cameras.append(nearest if name in registered else copy.copy(nearest))
-        else:
-            is_known = adjusted and (
-                camera.has_prior_focal_length or errors[adjusted[0].camera_id] < _FOCAL_LENGTH_ERROR
-            )
-            cameras.append(adjusted[0] if is_known else camera)
+    for i, camera in enumerate(initial):
+        adjusted = sharing.get(id(camera), {})
+        if len(set(map(id, adjusted.values()))) > 1:
+            places = np.array(list(adjusted))
+            nearest = adjusted[int(places[np.argmin(np.abs(places - i))])]
+            cameras.append(nearest if i in adjusted else copy.copy(nearest))
+            continue
+        found = next(iter(adjusted.values()), camera)
+        is_known = camera.has_prior_focal_length or determined.get(id(found), False)
+        cameras.append(found if is_known else camera)
     return cameras
 
 
@@ -514,20 +543,19 @@ def _warnings(models: Sequence[_Model], left: Sequence[str], num_images: int) ->
     """
     warnings = []
     if len(models) > 1:
-        parts = "; ".join(
+        parts = ", ".join(
             f"{len(images)} from '{images[0].name}' to '{images[-1].name}'"
             for images in (model.placed.images for model in models)
         )
         warnings.append(
-            f"hardly any points connect these parts, which are matched separately: {parts}; a "
-            "mapper makes a model of each, not always the largest first"
+            f"hardly any points connect {len(models)} parts of the images, which are matched "
+            f"separately: {parts}; a mapper makes a model of each, not always the largest first"
         )
     if left:
         warnings.append(
             f"{len(left)} of {num_images} images are not registered in the joint estimate and are "
             f"matched by motion alone: {some_names(left)}"
         )
-    adjustment = models[0].posed.adjustment
-    if adjustment is not None and adjustment.result.seams_warning is not None:
-        warnings.append(adjustment.result.seams_warning)
+    if models[0].adjusted.seams_warning is not None:
+        warnings.append(models[0].adjusted.seams_warning)
     return warnings

@@ -2,18 +2,19 @@
 
 Bundle adjustment converges to a local minimum. If few tracks cross a fast turn, the first mapping
 may be bent, and bundle adjustment does not straighten it. Even so, the corners that were found with
-its poses form longer and more accurate tracks than the motion that it was mapped from. Mapping
-these makes the model straighter. Its cost is not always lower, because hardly any points carry the
-scale across such a turn.
+its poses form longer and more accurate tracks than the motion that it was mapped from. A model that
+is mapped from these is usually less bent. Its cost may be about the same, because hardly any points
+carry the scale across such a turn.
 """
 
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
@@ -39,42 +40,46 @@ from colmap_av1.poses.pose_stages import (
     AdjustedResult,
     MappedResult,
 )
-from colmap_av1.poses.posed_images import posed_images_of, triangulate_in
+from colmap_av1.poses.posed_images import posed_images_of, registered_by_video, triangulate_in
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
-# The second mapping is rejected if fewer of the observations than this share agree with it.
-_LEAST_KEPT = 0.9
-# The second mapping is rejected if its cost exceeds that of the first one by this factor. Costs in
-# the same minimum differ by 0.1 %. In 18 walks, where the costs were 0.94 to 1.0004 times those of
-# the first mapping, the error of camera centres was 0.01 to 0.9 times as large, except in one walk
-# with an error of 0.2 %.
-_NOT_HIGHER = 1.002
+# The second mapping is rejected if it registers fewer images than this share, or if fewer of the
+# observations in its images than this share agree with it.
+_LEAST_REGISTERED, _LEAST_KEPT = 0.5, 0.9
+# It is rejected if its cost exceeds this multiple of the first cost. Costs at the same minimum
+# differ by 0.1 %. On 18 walks the ratio was 0.94 to 1.0004, and the error of camera centres fell to
+# 0.01 to 0.9 of the first on 17 of them; on the other it rose from 0.2 to 0.3 % of the extent. On
+# one walk the ratio was 1.007, and the error rose from 0.6 to 9.6 %.
+_MAX_COST_RATIO = 1.002
 
 
 @dataclass(frozen=True)
 class RemappedResult(MappedResult):
     """Result of `remap_stage`.
 
-    The other models are the images that the second mapping leaves out, as a model with their first
-    poses, and the other models of the first mapping.
+    `other_models` begins with a model of the images that the second mapping leaves out, if any,
+    with their first poses, and continues with the other models of the first mapping.
 
     Attributes:
+        share: share of the images that it registers.
         kept: share of the observations in its images that agree with the second mapping.
         cost: mean robust cost of these with the first poses.
         new_cost: mean robust cost of these with the second mapping, after adjustment.
     """
 
+    share: float
     kept: float
     cost: float
     new_cost: float
 
     @property
     def is_used(self) -> bool:
-        """Whether the second mapping fits the observations at least as well as the first one."""
-        return self.kept >= _LEAST_KEPT and self.new_cost <= _NOT_HIGHER * self.cost
+        """Whether it is large enough and fits the observations about as well as the first."""
+        is_whole = self.share >= _LEAST_REGISTERED and self.kept >= _LEAST_KEPT
+        return is_whole and self.new_cost <= _MAX_COST_RATIO * self.cost
 
 
 def remap_stage(
@@ -99,7 +104,8 @@ def remap_stage(
         files = [f"{name}/0.npz"]
         (partial / name).mkdir()
         write_posed_model(partial / files[0], PosedModel(poses.cameras, poses.images))
-        left = [image for image in known.images if image.name not in poses.by_name]
+        placed = poses.by_name
+        left = [image for image in known.images if image.name not in placed]
         if left:
             files.append(f"{name}/1.npz")
             write_posed_model(partial / files[1], PosedModel(known.cameras, left))
@@ -110,9 +116,10 @@ def remap_stage(
         return RemappedResult(
             poses=files[0],
             num_registered=len(poses.images),
-            registered={},
+            registered=registered_by_video(placed, image_set),
             mapper="global",
             other_models=(*files[1:], *mapped.result.other_models),
+            share=len(poses.images) / len(known.images),
             kept=kept,
             cost=cost,
             new_cost=new_cost,
@@ -126,7 +133,6 @@ def remap_stage(
             adjusted.digest,
             START_TRACKS,
             LOSS_SCALES,
-            _LEAST_KEPT,
             run.options.match.verify,
         ],
         RemappedResult,
@@ -165,7 +171,19 @@ def _map_tracks(
             start_tracks=START_TRACKS,
             ends_early=True,
         )
-        return posed_model(read_model(models / "0")) if sizes else None
+        return _with_camera_ids(posed_model(read_model(models / "0")), known) if sizes else None
+
+
+def _with_camera_ids(found: PosedModel, known: PosedModel) -> PosedModel:
+    """A model of images of `known`, with the camera ids of `known`."""
+    known_by_name = known.by_name
+    cameras, images = dict[int, pycolmap.Camera](), []
+    for image in found.images:
+        number = known_by_name[image.name].camera_id
+        cameras[number] = found.cameras[image.camera_id]
+        cameras[number].camera_id = number
+        images.append(replace(image, camera_id=number))
+    return PosedModel(cameras, images)
 
 
 def _costs(

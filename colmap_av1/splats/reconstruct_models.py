@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.estimate import Posed
@@ -77,8 +79,12 @@ def further_models(
         return [read_tracks_only(run, video) for video in range(len(run.sources))]
 
     for own in further_poses(run, first, image_set, tracks):
-        model = written_model(own.run, own.posed, own.image_set)[1].result
-        names = own.image_set.images.names
+        index = np.searchsorted(image_set.images.frames, own.image_set.images.frames)
+        assert run.positions is not None
+        placing = replace(own.run, positions=run.positions.some(index))
+        model = written_model(placing, own.posed, own.image_set)[1].result
+        placed = read_posed_images(own.run, own.posed.last, own.image_set)
+        names = [image.name for image in placed.images]
         registered.update(names)
         found.append(
             FurtherModel(

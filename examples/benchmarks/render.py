@@ -620,6 +620,7 @@ def walks(rows: list[Row]) -> str:
     """Models of walks with fast turns."""
     columns = [
         words("walk", "walk"),
+        words("way", "way"),
         words("images", "images"),
         words("registered", "registered"),
         words("camera centres", "errors"),

@@ -5,8 +5,8 @@ python examples/benchmarks/walks.py --cache benchmark_walks
 The script renders walks through three furnished rooms with plain walls, 320x240 at 25 frames per
 second. At the doors, the camera turns by 8 to 12 degrees per frame, with motion blur of half a
 frame. Each walk has its own furniture, turns and speed. True poses are known, intrinsics are not
-given. `reconstruct` runs with its defaults. A model is bent if its camera centres have an error of
-more than 2 % of their extent.
+given. `reconstruct` runs with its defaults, and so does COLMAP's incremental mapper on the database
+of `match`. A model is bent if its camera centres have an error of more than 2 % of their extent.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from results import add_results, read_rows, save
 from sequences import model_poses
 
-from colmap_av1 import ColmapAv1Error, reconstruct
+from colmap_av1 import ColmapAv1Error, MatchReport, ReconstructReport, match, reconstruct
 from colmap_av1.evaluate import pose_errors
 from colmap_av1.geometry.colmap_model import read_model
 
@@ -43,6 +43,7 @@ BENT = 0.02
 NUM_BLURRED = 3
 # Number of different textures. They are stacked, and cv2.remap accepts at most 32767 rows.
 NUM_FACES = 60
+WAYS = ("reconstruct", "match, mapper")
 PLAIN = 3.0  # standard deviation of plain walls in grey levels
 
 
@@ -52,13 +53,15 @@ class Row:
 
     Attributes:
         walk: seed of the walk.
+        way: how the models were made, one of `WAYS`.
         images: number of chosen images.
-        registered: number of registered images of each model, the largest model first.
+        registered: number of registered images of each model, in the order of their folders.
         errors: error of the camera centres of each model, as a share of their extent.
-        warnings: warnings of `reconstruct`.
+        warnings: warnings of `reconstruct` or `match`.
     """
 
     walk: str
+    way: str
     images: int
     registered: str
     errors: str
@@ -66,12 +69,13 @@ class Row:
 
 
 def main() -> int:
-    """Reconstruct each walk, and save and print the table."""
+    """Make the models of each walk, and save and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--cache", type=Path, required=True, help="folder for clips and models")
     parser.add_argument("--walks", nargs="+", type=int, default=list(range(20)))
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS, metavar="WAY")
     add_results(parser, "walks")
     arguments = parser.parse_args()
     for seed in arguments.walks:
@@ -80,28 +84,41 @@ def main() -> int:
         if not video.is_file():
             folder.mkdir(parents=True, exist_ok=True)
             make_clip(video, seed)
-        save(arguments.results, [asdict(measure(video, seed))], ("walk",))
+        for way in arguments.ways:
+            save(arguments.results, [asdict(measure(video, seed, way))], ("walk", "way"))
     print(render.walks(read_rows(arguments.results)), end="")
     return 0
 
 
-def measure(video: Path, seed: int) -> Row:
-    """Reconstruct a walk."""
-    output = video.parent / "output"
+def measure(video: Path, seed: int, way: str) -> Row:
+    """Make the models of a walk."""
+    output = video.parent / ("output" if way == WAYS[0] else "mapped")
     shutil.rmtree(output, ignore_errors=True)
+    report: ReconstructReport | MatchReport
     try:
-        report = reconstruct(video, output)
+        if way == WAYS[0]:
+            report = reconstruct(video, output)
+            folders = [output, *(model.output for model in report.other_models)]
+            made = [read_model(own / "sparse" / "0") for own in folders]
+        else:
+            output.mkdir()
+            report = match(output / "walk.db", video, image_path=output / "images")
+            (output / "models").mkdir()
+            found = pycolmap.incremental_mapping(
+                report.database, output / "images", output / "models"
+            )
+            made = [found[number] for number in sorted(found)]
     except ColmapAv1Error as error:
-        return Row(str(seed), 0, "", "", str(error))
+        return Row(str(seed), way, 0, "", "", str(error))
     truth = walk(seed)
-    folders = [output, *(model.output for model in report.other_models)]
-    models = [model_poses(read_model(own / "sparse" / "0"), len(truth)) for own in folders]
-    found = [pose_errors(model, truth) for model in models]
+    models = [model_poses(own, len(truth)) for own in made]
+    errors = [pose_errors(own, truth) for own in models]
     return Row(
         str(seed),
+        way,
         report.num_images,
-        " + ".join(str(int(np.isfinite(model[:, 0, 0]).sum())) for model in models),
-        " + ".join("-" if own is None else f"{own.ate / own.extent:.2%}" for own in found),
+        " + ".join(str(int(np.isfinite(own[:, 0, 0]).sum())) for own in models),
+        " + ".join("-" if own is None else f"{own.ate / own.extent:.2%}" for own in errors),
         "; ".join(report.warnings),
     )
 

@@ -184,7 +184,7 @@ def test_nothing_is_left_beside_the_database(joint: MatchReport) -> None:
 
 @pytest.mark.parametrize("count", [13, 8])
 def test_two_scenes(count: int, encode: Callable[..., Path], tmp_path: Path) -> None:
-    """An estimate has a model of each, the larger first, except of too few images."""
+    """An estimate has a model of each scene, the larger first; one of few images has none."""
     pictures = [picture for _, picture in decode_frames(SCENE)]
     videos = [
         encode(np.stack([p[:, ::-1] for p in pictures[40 : 40 + count]]), tmp_path / "one.mp4"),
@@ -198,7 +198,7 @@ def test_two_scenes(count: int, encode: Callable[..., Path], tmp_path: Path) -> 
     assert report.estimate is not None
     first, *others = report.estimate.num_registered
     assert first >= 16
-    assert [count >= 11 for count in others] == [True] * (count >= 10)
+    assert [number >= 11 for number in others] == [True] * (count >= 10)
     left = report.num_images - first - sum(others)
     warned = any(f"{left} of {report.num_images} " in warning for warning in report.warnings)
     assert warned == (left > 0)

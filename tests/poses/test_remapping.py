@@ -72,13 +72,14 @@ def test_all_images_that_share_points_are_paired() -> None:
 
 
 def test_a_second_mapping_is_used_unless_it_fits_the_observations_worse() -> None:
-    def result(kept: float, new_cost: float) -> RemappedResult:
-        return RemappedResult("", 3, {}, "global", (), kept=kept, cost=1.0, new_cost=new_cost)
+    def result(kept: float, new_cost: float, share: float = 1.0) -> RemappedResult:
+        return RemappedResult("", 3, {}, "global", (), share, kept, cost=1.0, new_cost=new_cost)
 
     assert result(kept=0.97, new_cost=0.8).is_used
     assert result(kept=0.97, new_cost=1.0).is_used
     assert not result(kept=0.97, new_cost=1.1).is_used
     assert not result(kept=0.5, new_cost=0.1).is_used
+    assert not result(kept=0.97, new_cost=0.1, share=0.2).is_used
 
 
 def tracks_of_lengths(length: int, num_frames: int = 60) -> Tracks:
