@@ -35,16 +35,17 @@ _MIN_INLIERS = INITIAL_MIN_INLIERS // 2
 # twenty times. If the pose is right, the angles differ by less than a third.
 _ANGLE_FACTOR = 1.5
 _ERROR_FACTOR = 1.5
-_NONE_KNOWN = KnownPoses()
 # The error of a pose is this quantile of its matches' errors.
 _ERROR_QUANTILE = 0.9
+
+_NO_POSES = KnownPoses()
 
 
 def demote_bad_initial_pairs(
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
     clock: Clock,
-    known: KnownPoses = _NONE_KNOWN,
+    known: KnownPoses = _NO_POSES,
 ) -> MatchedImages:
     """Limit the inliers of pairs that would make a bad initial pair.
 

@@ -134,7 +134,8 @@ def focal_length_errors(model: PosedModel) -> dict[int, float]:
     observations are assumed independent, so the true error may be several times as large.
 
     Args:
-        model: an adjusted model, with points. Of large models, a selection is used.
+        model: an adjusted model, with points. If it is large, some of its images and observations
+            are used.
 
     Returns:
         The relative standard deviation by camera id; infinite if the focal length is not

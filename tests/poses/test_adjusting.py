@@ -106,7 +106,8 @@ def test_turns_determine_the_focal_length_and_a_straight_path_does_not() -> None
         several = keep_observations(points, np.repeat(counts >= 3, counts))[0]
         errors[turn] = focal_length_errors(PosedModel({1: camera}, images, several))[1]
     assert errors[6.0] < 0.005
-    assert errors[0.0] > 0.1  # infinite, but for rounding
+    # It is infinite, unless rounding errors make it finite.
+    assert errors[0.0] > 0.1
 
 
 def test_half_of_the_observations_determine_the_poses(
