@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from colmap_av1.batch.page import write_page
     from colmap_av1.batch.run import BatchReport, run_batch
-    from colmap_av1.check.database import CheckReport, check
+    from colmap_av1.check.database import DatabaseCheck, check_database
+    from colmap_av1.check.model import ModelCheck, check_model
     from colmap_av1.densify import DensifyReport, densify
     from colmap_av1.errors import (
         BitstreamError,
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from colmap_av1.map import MapReport, map_database
     from colmap_av1.match import MatchReport, match
     from colmap_av1.motion.frame_motion import FrameMotion
-    from colmap_av1.motion.info import StreamReport, inspect
+    from colmap_av1.motion.info import StreamReport, read_info
     from colmap_av1.motion.motion_file import export_motion
     from colmap_av1.motion.reading import read_motion
     from colmap_av1.options import (
@@ -73,9 +74,9 @@ __all__ = [
     "BatchReport",
     "BitstreamError",
     "CameraOptions",
-    "CheckReport",
     "ColmapAv1Error",
     "CompareOptions",
+    "DatabaseCheck",
     "DatabaseError",
     "DensifyOptions",
     "DensifyReport",
@@ -100,6 +101,7 @@ __all__ = [
     "MaskOptions",
     "MatchOptions",
     "MatchReport",
+    "ModelCheck",
     "ModelError",
     "NotAv1Error",
     "OptionError",
@@ -118,15 +120,16 @@ __all__ = [
     "VideoError",
     "ViewOptions",
     "build_tracks",
-    "check",
+    "check_database",
+    "check_model",
     "densify",
     "encode",
     "export_hloc",
     "export_motion",
-    "inspect",
     "map_database",
     "match",
     "read_hloc",
+    "read_info",
     "read_motion",
     "reconstruct",
     "run_batch",
@@ -136,7 +139,7 @@ __all__ = [
 # Modules of the public names, except errors and options.
 _MODULES = {
     "BatchReport": "batch.run",
-    "CheckReport": "check.database",
+    "DatabaseCheck": "check.database",
     "DensifyReport": "densify",
     "EncodeReport": "video.encode",
     "FrameMotion": "motion.frame_motion",
@@ -144,19 +147,21 @@ _MODULES = {
     "HlocMatches": "interop.hloc",
     "MapReport": "map",
     "MatchReport": "match",
+    "ModelCheck": "check.model",
     "ReconstructReport": "reconstruct",
     "StreamReport": "motion.info",
     "Tracks": "tracks.tracks",
     "build_tracks": "tracks.tracks",
-    "check": "check.database",
+    "check_database": "check.database",
+    "check_model": "check.model",
     "densify": "densify",
     "encode": "video.encode",
     "export_hloc": "interop.hloc",
     "export_motion": "motion.motion_file",
-    "inspect": "motion.info",
     "map_database": "map",
     "match": "match",
     "read_hloc": "interop.hloc",
+    "read_info": "motion.info",
     "read_motion": "motion.reading",
     "reconstruct": "reconstruct",
     "run_batch": "batch.run",

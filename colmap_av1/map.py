@@ -14,7 +14,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.check.database import CheckReport, check
+from colmap_av1.check.database import DatabaseCheck, check_database
 from colmap_av1.check.model import check_model
 from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.database.file import copy_database
@@ -239,9 +239,9 @@ def _place(
     return found
 
 
-def _check_input(database: Path, image_path: Path) -> CheckReport:
+def _check_input(database: Path, image_path: Path) -> DatabaseCheck:
     """Refuse inputs that make a mapper fail."""
-    checked = check(database)
+    checked = check_database(database)
     if not checked.depth.is_observable:
         raise DatabaseError(f"{database}: {checked.depth.warning}")
     stops = [f.text for f in checked.findings if f.severity == "error"]

@@ -150,6 +150,11 @@ class ReconstructReport:
     warnings: tuple[str, ...]
     timelines: tuple[VideoTimeline, ...]
 
+    @property
+    def model(self) -> Path:
+        """Folder of the COLMAP model with the most images."""
+        return self.output / "sparse" / "0"
+
 
 @one_blas_thread()
 def reconstruct(

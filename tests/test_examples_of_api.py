@@ -17,7 +17,8 @@ FUNCTIONS = [name for name in colmap_av1.__all__ if name.islower()]
 CLASSES = ["FrameMotion", "MatchOptions", "ReconstructOptions", "Tracks"]
 # Examples that read what another example writes.
 NEEDS = {
-    "check": "match",
+    "check_database": "match",
+    "check_model": "map_database",
     "map_database": "match",
     "densify": "map_database",
     "export_hloc": "match",

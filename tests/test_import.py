@@ -34,8 +34,8 @@ def test_import_loads_no_libraries_and_installs_nothing(tmp_path: Path) -> None:
 def test_modules_do_not_hide_functions_of_the_same_name(tmp_path: Path) -> None:
     run = run_python(
         "import colmap_av1.match, colmap_av1.check.database, colmap_av1.densify\n"
-        "from colmap_av1 import check, densify, match\n"
-        "assert all(callable(f) for f in (check, densify, match, colmap_av1.match))",
+        "from colmap_av1 import check_database, densify, match\n"
+        "assert all(callable(f) for f in (check_database, densify, match, colmap_av1.match))",
         tmp_path,
     )
     assert run.stderr == ""
@@ -49,7 +49,7 @@ def test_every_public_name_exists() -> None:
 
 def test_numpy_is_imported_before_pycolmap(tmp_path: Path) -> None:
     """In the other order the writing of a PNG file ends the process."""
-    for name in ("check", "reconstruct"):
+    for name in ("check_database", "check_model", "reconstruct"):
         run = run_python(
             f"import colmap_av1, sys; colmap_av1.{name}; print(*sys.modules)", tmp_path
         )

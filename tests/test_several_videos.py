@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from trainers import brush
 
-from colmap_av1.check.database import check
+from colmap_av1.check.database import check_database
 from colmap_av1.cli import main
 from colmap_av1.database.reading import read_cameras, read_images
 from colmap_av1.densify import densify
@@ -117,7 +117,7 @@ def test_two_videos_and_photos_are_one_database(
     by_camera = {i.camera_id: (i.width, i.height) for i in listed}
     assert list(by_camera.values()) == [SIZE, SIZE, (480, 270)]
     assert [image.camera_id for image in listed[::NUM_IMAGES]] == [1, 2, 3]
-    assert check(tmp_path / "a.db").num_connected_images == report.num_images
+    assert check_database(tmp_path / "a.db").num_connected_images == report.num_images
 
 
 def test_videos_share_a_camera_where_they_are_told_to(

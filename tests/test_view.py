@@ -20,7 +20,7 @@ from colmap_av1 import view
 from colmap_av1.cli import main
 from colmap_av1.errors import ColmapAv1Error, LimitError, ModelError, OptionError, VideoError
 from colmap_av1.match import match
-from colmap_av1.motion.info import inspect
+from colmap_av1.motion.info import read_info
 from colmap_av1.options import DensityOptions, MatchOptions, TrackOptions, ViewOptions
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.view import model as model_view
@@ -226,7 +226,7 @@ def test_view_says_what_it_lacks(
 
 
 @pytest.mark.shared
-@pytest.mark.parametrize("read", [inspect, lambda video: view.view_video(video, "drawn.mp4")])
+@pytest.mark.parametrize("read", [read_info, lambda video: view.view_video(video, "drawn.mp4")])
 def test_frames_that_are_too_large_are_refused_before_one_is_decoded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], object]
 ) -> None:

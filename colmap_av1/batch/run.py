@@ -87,7 +87,7 @@ class BatchReport:
     warnings: tuple[str, ...]
 
 
-Watch = Callable[[Counts, "Row | None"], None]
+OnProgress = Callable[[Counts, "Row | None"], None]
 
 
 def run_batch(
@@ -97,8 +97,8 @@ def run_batch(
     *,
     models: str | os.PathLike[str] | None = None,
     options: BatchOptions | None = None,
-    hear: Callable[[str], None] | None = None,
-    watch: Watch | None = None,
+    on_start: Callable[[str], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> BatchReport:
     """Run one task on many videos.
 
@@ -114,8 +114,8 @@ def run_batch(
             `densify`, or `ReadOptions` for `info`.
         models: for `densify`: folder or URL with a model for each video, under its name.
         options: where the videos are processed, and how failures are handled.
-        hear: called once with a line about the resources in use.
-        watch: called at the start, and with the row of each video when it has ended.
+        on_start: called once with a line about the resources in use.
+        on_progress: called at the start, and with the row of each video when it has ended.
 
     Raises:
         OptionError: the inputs or options are invalid, or the output cannot be written.
@@ -148,9 +148,9 @@ def run_batch(
             else RayEngine(work, options)
         )
         opened.callback(engine.close)
-        if hear is not None:
-            hear(engine.about)
-        watch = watch if watch is not None else _watch_nothing
+        if on_start is not None:
+            on_start(engine.about)
+        on_progress = on_progress if on_progress is not None else _ignore_progress
         facts = {
             "task": work.task,
             "options": dataclasses.asdict(cast(Any, work.options)),
@@ -160,7 +160,7 @@ def run_batch(
         rows: dict[int, Row] = {}
         next_time = 0.0
         counts = Counts(len(videos))
-        watch(counts, None)
+        on_progress(counts, None)
         cpu_seconds = video_seconds = 0.0
         try:
             for position, outcome in _outcomes(engine, videos):
@@ -175,7 +175,7 @@ def run_batch(
                 if row.state == "done" and not outcome.kept:
                     cpu_seconds += row.cpu_seconds or 0.0
                     video_seconds += row.video_seconds or 0.0
-                watch(counts, row)
+                on_progress(counts, row)
                 before = time.monotonic()
                 if before >= next_time:
                     with suppress(OptionError):
@@ -331,5 +331,5 @@ def _work_of(task: Options, output: str, models: str | None, options: BatchOptio
     )
 
 
-def _watch_nothing(counts: Counts, row: Row | None) -> None:
+def _ignore_progress(counts: Counts, row: Row | None) -> None:
     del counts, row

@@ -39,7 +39,7 @@ from colmap_av1.util.graphs import connected_components
 
 
 @dataclass(frozen=True)
-class CheckReport:
+class DatabaseCheck:
     """Contents of a database, and what the mappers will do with it.
 
     Attributes:
@@ -102,7 +102,7 @@ class CheckReport:
         return any(finding.damage for finding in self.findings)
 
 
-def check(database: str | os.PathLike[str]) -> CheckReport:
+def check_database(database: str | os.PathLike[str]) -> DatabaseCheck:
     """Check what the mappers will do with a COLMAP database of any version.
 
     The database is not changed or migrated, and no file is created next to it. The thresholds are
@@ -115,8 +115,8 @@ def check(database: str | os.PathLike[str]) -> CheckReport:
         DatabaseError: the file is missing, locked, unreadable, or not a COLMAP database.
 
     Examples:
-        >>> from colmap_av1 import check
-        >>> report = check("my.db")
+        >>> from colmap_av1 import check_database
+        >>> report = check_database("my.db")
         >>> report.num_images, report.image_sizes
         (10, {(640, 360): 10})
         >>> report.mappable, report.findings
@@ -130,7 +130,7 @@ def check(database: str | os.PathLike[str]) -> CheckReport:
         return _check(connection, path)
 
 
-def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
+def _check(connection: sqlite3.Connection, path: Path) -> DatabaseCheck:
     cameras = cameras_of(connection, path)
     images = images_with_rows(connection, path)
     pairs = pairs_with_rows(connection, path, images)
@@ -159,7 +159,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> CheckReport:
         *orphan_findings(connection, pairs),
     ]
     order = ("error", "warning", "note")
-    return CheckReport(
+    return DatabaseCheck(
         database=path,
         user_version=connection.execute("PRAGMA user_version").fetchone()[0],
         layout=layout,

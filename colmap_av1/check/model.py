@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 
 from colmap_av1.check.crossings import Crossings, model_crossings
 from colmap_av1.check.model_figures import ModelFigures, model_figures
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.poses.long_range import LongRangeErrors, model_long_range_errors
 from colmap_av1.poses.seams import Seams, model_seams
 from colmap_av1.util.progress import Progress, no_progress
@@ -44,29 +47,41 @@ class ModelCheck:
 
 
 def check_model(
-    model: pycolmap.Reconstruction,
+    model: str | os.PathLike[str] | pycolmap.Reconstruction,
     *,
-    image_path: Path | None = None,
-    database: Path | None = None,
-    progress: Progress = no_progress,
+    image_path: str | os.PathLike[str] | None = None,
+    database: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
 ) -> ModelCheck:
     """Check whether the poses of a model are consistent.
 
     Args:
-        model: the model.
+        model: the model, or its folder.
         image_path: folder of its images, for the long-range check.
         database: COLMAP database of its matches, which is not changed.
-        progress: called for the stage "far views".
+        progress: called with the stage "far views", the amount of work done, and the total.
 
     Raises:
+        ModelError: the model cannot be read or has no poses.
         ImageError: an image is missing, unreadable or of another size than its camera.
         DatabaseError: the database cannot be read, or is damaged.
+
+    Examples:
+        >>> from colmap_av1 import check_model
+        >>> found = check_model("my_model/0", image_path="my_frames")
+        >>> found.figures.num_registered, found.warnings
+        (10, ())
     """
+    if not isinstance(model, pycolmap.Reconstruction):
+        model = read_model(model)
     # The long-range check comes first, because it raises if images are missing.
-    far_views = None if image_path is None else model_long_range_errors(model, image_path, progress)
+    far_views = None
+    if image_path is not None:
+        progress = progress if progress is not None else no_progress
+        far_views = model_long_range_errors(model, Path(image_path), progress)
     return ModelCheck(
         figures=model_figures(model),
         seams=model_seams(model),
-        crossings=None if database is None else model_crossings(model, database),
+        crossings=None if database is None else model_crossings(model, Path(database)),
         far_views=far_views,
     )

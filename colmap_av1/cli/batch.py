@@ -57,15 +57,15 @@ def run(namespace: argparse.Namespace) -> int | None:
     options = given(namespace, BatchOptions)
     from colmap_av1.cli.batch_progress import batch_progress
 
-    with batch_progress(namespace.quiet) as (hear, watch):
+    with batch_progress(namespace.quiet) as (on_start, on_progress):
         report = colmap_av1.run_batch(
             namespace.inputs,
             namespace.output,
             task,
             models=namespace.models,
             options=options,
-            hear=hear,
-            watch=watch,
+            on_start=on_start,
+            on_progress=on_progress,
         )
     print_result(namespace, batch_rows(report), report.warnings)
     return _SOME_FAILED if report.failed else None

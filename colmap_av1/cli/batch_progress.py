@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from colmap_av1.batch.rows import Row
-from colmap_av1.batch.run import Counts, Watch
+from colmap_av1.batch.run import Counts, OnProgress
 from colmap_av1.cli.terminal import PROGRAM, print_note, print_warning
 from colmap_av1.util.texts import on_one_line
 
@@ -22,11 +22,11 @@ _MOST_LINES = 20
 
 
 @contextmanager
-def batch_progress(quiet: bool) -> Iterator[tuple[Callable[[str], None], Watch]]:
+def batch_progress(quiet: bool) -> Iterator[tuple[Callable[[str], None], OnProgress]]:
     """Callbacks for `run_batch` that print progress; failures are printed even if quiet."""
     if quiet or not sys.stderr.isatty():
         lines = _Lines(quiet)
-        yield lines.hear, lines.watch
+        yield lines.on_start, lines.on_progress
         return
     columns = (
         TextColumn("{task.description}"),
@@ -44,7 +44,7 @@ def batch_progress(quiet: bool) -> Iterator[tuple[Callable[[str], None], Watch]]
 
         failures = _Failures(show)
 
-        def watch(counts: Counts, row: Row | None) -> None:
+        def on_progress(counts: Counts, row: Row | None) -> None:
             failures.show(row)
             speed = progress.tasks[bar].speed
             progress.update(
@@ -55,7 +55,7 @@ def batch_progress(quiet: bool) -> Iterator[tuple[Callable[[str], None], Watch]]
                 failed=_failed(counts),
             )
 
-        yield (lambda about: progress.console.print(Text(about))), watch
+        yield (lambda about: progress.console.print(Text(about))), on_progress
 
 
 class _Failures:
@@ -83,11 +83,11 @@ class _Lines:
         self._failures = _Failures(lambda text: print_warning(text.removeprefix("warning: ")))
         self._start = self._last = time.monotonic()
 
-    def hear(self, about: str) -> None:
+    def on_start(self, about: str) -> None:
         if not self._quiet:
             print_note(about)
 
-    def watch(self, counts: Counts, row: Row | None) -> None:
+    def on_progress(self, counts: Counts, row: Row | None) -> None:
         self._failures.show(row)
         now = time.monotonic()
         if self._quiet or now - self._last < _LINE_EVERY:

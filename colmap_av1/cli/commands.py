@@ -261,9 +261,7 @@ def _info(namespace: argparse.Namespace) -> None:
     options = given(namespace, ReadOptions)
     read_out = None
     with progress_bars(namespace.quiet) as report:
-        result = colmap_av1.inspect(
-            namespace.video, options, lambda done: report("motion", done, None)
-        )
+        result = colmap_av1.read_info(namespace.video, options, report)
         if namespace.rolling_shutter == "estimate":
             from colmap_av1.matching.shutter.of_video import estimate_video_read_out
 
@@ -279,7 +277,7 @@ def _check(namespace: argparse.Namespace) -> int:
         raise OptionError("a model is checked with its images: give both --model and --image_path")
     good = True
     if namespace.database is not None:
-        result = colmap_av1.check(namespace.database)
+        result = colmap_av1.check_database(namespace.database)
         print_result(namespace, reports.check_rows(result))
         good = result.mappable and not result.damaged
     if namespace.model is not None:
@@ -289,16 +287,11 @@ def _check(namespace: argparse.Namespace) -> int:
 
 def _check_model(namespace: argparse.Namespace) -> bool:
     """Print the diagnosis of a model, and return whether it is consistent."""
-    from colmap_av1.check.model import check_model
-    from colmap_av1.geometry.colmap_model import read_model
-
-    model = read_model(namespace.model)
-    database = None if namespace.database is None else Path(namespace.database)
     with progress_bars(namespace.quiet) as report:
-        found = check_model(
-            model,
-            image_path=Path(namespace.image_path),
-            database=database,
+        found = colmap_av1.check_model(
+            namespace.model,
+            image_path=namespace.image_path,
+            database=namespace.database,
             progress=report,
         )
     print_result(namespace, reports.model_rows(found), found.warnings)
@@ -311,7 +304,7 @@ def _motion(namespace: argparse.Namespace) -> None:
             namespace.video,
             namespace.output,
             given(namespace, ReadOptions),
-            lambda done: report("motion", done, None),
+            report,
             overwrite=namespace.overwrite,
         )
     print_result(namespace, [("coded frames", str(count)), ("output", namespace.output)])
@@ -382,8 +375,6 @@ def _view(namespace: argparse.Namespace) -> None:
 
 
 def _view_page(namespace: argparse.Namespace) -> None:
-    from colmap_av1.check.model import check_model
-    from colmap_av1.geometry.colmap_model import read_model
     from colmap_av1.reconstruct import read_report
     from colmap_av1.view.page import check_page, write_model_page
 
@@ -398,7 +389,7 @@ def _view_page(namespace: argparse.Namespace) -> None:
     if report is not None:
         rows = reports.reconstruct_rows(report)
     else:
-        rows = reports.model_rows(check_model(read_model(model)))
+        rows = reports.model_rows(colmap_av1.check_model(model))
     write_model_page(
         model,
         namespace.output,

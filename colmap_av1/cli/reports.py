@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # these modules are slow to import
     from colmap_av1.batch.run import BatchReport
-    from colmap_av1.check.database import CheckReport
+    from colmap_av1.check.database import DatabaseCheck
     from colmap_av1.check.model import ModelCheck
     from colmap_av1.densify import DensifyReport
     from colmap_av1.evaluate.report.results import CompareReport
@@ -324,7 +324,7 @@ def read_out_rows(found: VideoReadOut | str | None) -> Rows:
     return [("rolling shutter", words)]
 
 
-def check_rows(report: CheckReport) -> Rows:
+def check_rows(report: DatabaseCheck) -> Rows:
     """Contents of a database, and whether the mappers can use it."""
     sizes = [f"{w}x{h} {n}" for (w, h), n in report.image_sizes.items()]
     shapes = [f"{n} with {c} columns" for c, n in report.keypoint_columns.items()]

@@ -7,7 +7,7 @@ import math
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from colmap_av1.errors import BitstreamError, VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.reading import count_with_repeats, first_showings, read_motion
 from colmap_av1.options import ReadOptions
+from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.container import open_stream
 from colmap_av1.video.display import Display
 from colmap_av1.video.facts import Video, read_video
@@ -91,30 +92,30 @@ class StreamReport:
         return not self.reasons
 
 
-def inspect(
+def read_info(
     video: str | os.PathLike[str],
     options: ReadOptions | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Progress | None = None,
 ) -> StreamReport:
     """Read a whole stream and judge how good its motion is for matching.
 
     Args:
         video: the video file.
         options: how the bitstream is read.
-        progress: called with the number of coded frames so far.
+        progress: called with the stage "motion" and the number of coded frames so far.
 
     Raises:
         VideoError: the video cannot be read or shows no frame.
         BitstreamError: the stream is damaged and `options.strict` is set.
 
     Examples:
-        >>> from colmap_av1 import inspect
-        >>> report = inspect("video.mp4")
+        >>> from colmap_av1 import read_info
+        >>> report = read_info("video.mp4")
         >>> report.num_shown, report.num_key_frames, report.good
         (60, 1, True)
     """
     options = options if options is not None else ReadOptions()
-    counts = _count(read_motion(video, options), progress)
+    counts = _count(read_motion(video, options), progress or no_progress)
     structure = counts.structure
     if structure.num_shown > 0:
         # Frames that are shown again are not coded frames, and a stream may end with them.
@@ -254,7 +255,7 @@ class _Counts:
     first_of_size: dict[tuple[int, int], int] = field(default_factory=dict)
 
 
-def _count(motion: Iterable[FrameMotion], progress: Callable[[int], None] | None) -> _Counts:
+def _count(motion: Iterable[FrameMotion], progress: Progress) -> _Counts:
     counts = _Counts()
     for frame in motion:
         counts.structure.add(frame)
@@ -263,8 +264,7 @@ def _count(motion: Iterable[FrameMotion], progress: Callable[[int], None] | None
         else:
             counts.first_of_size.setdefault((frame.width, frame.height), frame.display_index)
         _count_references(frame, counts)
-        if progress is not None:
-            progress(counts.structure.num_coded)
+        progress("motion", counts.structure.num_coded, None)
     return counts
 
 

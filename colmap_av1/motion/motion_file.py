@@ -19,6 +19,7 @@ from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
 from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
 from colmap_av1.util.hdf5 import new_hdf5
+from colmap_av1.util.progress import Progress
 
 # Zip members have a date. A fixed one makes the bytes of the file reproducible.
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -28,7 +29,7 @@ def export_motion(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],
     options: ReadOptions | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Progress | None = None,
     *,
     overwrite: bool = False,
 ) -> int:
@@ -43,7 +44,7 @@ def export_motion(
         video: the video file.
         output: the file; its extension .npz, .h5 or .hdf5 selects the format.
         options: how the bitstream is read.
-        progress: called with the number of frames written so far.
+        progress: called with the stage "motion" and the number of frames written so far.
         overwrite: replace an existing output.
 
     Returns:
@@ -78,7 +79,7 @@ def export_motion(
                         write(f"{count:06d}/{name}", array)
                     count += 1
                     if progress is not None:
-                        progress(count)
+                        progress("motion", count, None)
             if count == 0:
                 raise VideoError(f"{video}: has no frames: give another video")
     except OSError as error:

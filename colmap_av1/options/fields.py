@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 import math
 import os
 import types
@@ -99,6 +100,16 @@ class Options:
 
     title: ClassVar[str] = ""
     colmap_prefix: ClassVar[str] = ""
+
+    def __init_subclass__(cls) -> None:
+        # The help of the fields is part of the docstring, for `help()` and the documentation.
+        fields = [
+            f"    {name}: {declared.help or f'see `{type(field.default).__name__}`'}"
+            for name, field in vars(cls).items()
+            if isinstance(field, dataclasses.Field) and (declared := declared_of(field))
+        ]
+        text = inspect.cleandoc(cls.__doc__ or "")
+        cls.__doc__ = "\n".join([text, "", "Attributes:", *fields]) if fields else text
 
     def __post_init__(self) -> None:
         hints = field_types(type(self))

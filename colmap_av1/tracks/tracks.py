@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import TrackOptions
 from colmap_av1.util.memory import give_back_free_memory
+from colmap_av1.util.progress import Progress
 from colmap_av1.video.display import Display, shown_points, shown_size
 
 # Width in pixels of the units that have motion.
@@ -328,7 +329,7 @@ class Tracks:
 def build_tracks(
     motion: Iterable[FrameMotion],
     options: TrackOptions | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Progress | None = None,
     *,
     frames: NDArray[np.int32] | None = None,
 ) -> Tracks:
@@ -350,7 +351,8 @@ def build_tracks(
     Args:
         motion: the coded frames of one video, in bitstream order.
         options: how to chain; the defaults of TrackOptions if None.
-        progress: called after each coded frame with the number of frames so far.
+        progress: called after each coded frame with the stage "tracks" and the number of frames so
+            far.
         frames: int32 [n] display indices of the frames whose observations are kept, which limits
             memory; None: all frames.
 
@@ -385,7 +387,7 @@ def build_tracks(
             )
         builder.add(frame)
         if progress is not None:
-            progress(count)
+            progress("tracks", count, None)
     num_frames, width, height, offsets, frame_index, xy, sigma = builder.finish()
     give_back_free_memory()  # building needs as much memory again as the tracks
     if num_frames == 0:

@@ -19,7 +19,7 @@ from colmap_av1.errors import (
     cannot_write,
 )
 from colmap_av1.motion.frame_motion import FrameMotion
-from colmap_av1.motion.info import Structure, inspect
+from colmap_av1.motion.info import Structure, read_info
 from colmap_av1.motion.reading import count_with_repeats, first_showings, read_motion
 from colmap_av1.options import (
     EncodeOptions,
@@ -120,7 +120,7 @@ def open_source(
     """
     # A killed run may have left its stream here, even if this video needs no conversion.
     remove_leftovers(next_to.resolve().parent, next_to.resolve().name)
-    if video.codec == "av1" and not (options.reencode and inspect(video, options.read).reasons):
+    if video.codec == "av1" and not (options.reencode and read_info(video, options.read).reasons):
         yield VideoSource(video, video)
         return
     strict = options.read.strict
@@ -231,7 +231,7 @@ def track_video(
     structure = Structure()
     motion = _counted(clock.iterate("motion", motion), structure)
 
-    def count(done: int) -> None:
+    def count(stage: str, done: int, total: int | None) -> None:
         progress("motion", done, source.stream.likely_num_packets)
 
     with warnings.catch_warnings(record=True) as caught:

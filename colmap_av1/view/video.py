@@ -98,7 +98,7 @@ def view_video(
             check_new_file(existing, [video], overwrite=overwrite)
         total = file.likely_num_packets
         chained = build_tracks(
-            read_motion(video, read), tracks, lambda done: report("tracks", done, total)
+            read_motion(video, read), tracks, lambda stage, done, _: report(stage, done, total)
         )
         first = first_showings(video, read if read is not None else ReadOptions())
         chained = chained.with_repeats(first[: count_with_repeats(first, chained.num_frames)])

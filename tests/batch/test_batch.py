@@ -44,7 +44,7 @@ DONE = ["a/clip0", "a/clip2", "a/clip4", "b/clip1", "b/clip3", "b/clip5"]
 def test_every_video_ends_done_or_named(clips: Path, tmp_path: Path) -> None:
     seen: list[int] = []
     out = tmp_path / "out"
-    report = run_batch(clips, out, SMALL, watch=lambda counts, _: seen.append(counts.ended))
+    report = run_batch(clips, out, SMALL, on_progress=lambda counts, _: seen.append(counts.ended))
     assert (report.num_videos, report.num_done, report.num_kept) == (8, 6, 0)
     assert report.failed == {"damaged": 1, "unreadable": 1}
     assert seen == list(range(9))
@@ -267,7 +267,7 @@ def test_one_batch_at_a_time(
                 tried.append(other)
 
     options = BatchOptions(retries=0, shard=shard)
-    run_batch(video, out, ReadOptions(), options=options, watch=try_others)
+    run_batch(video, out, ReadOptions(), options=options, on_progress=try_others)
     assert tried == refused
     for other in refused:
         run_batch(video, out, ReadOptions(), options=BatchOptions(shard=other))

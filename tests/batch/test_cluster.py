@@ -70,7 +70,7 @@ def test_a_cluster_that_loses_processes_and_a_node(
         if counts.ended == 4 and len(cluster.worker_nodes) == 1:
             cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
 
-    report = run_batch(clips, out, ReadOptions(), options=options, watch=harm)
+    report = run_batch(clips, out, ReadOptions(), options=options, on_progress=harm)
     assert (report.num_done, report.failed) == (6, {"damaged": 1, "unreadable": 1})
     assert rows_of(out) == rows_of(local)
     assert files_of(out) == files_of(local)

@@ -100,7 +100,7 @@ def test_a_process_that_ends(number: str, reason: str, clips: Path, tmp_path: Pa
 
     videos = [clips / "a" / "clip0.mp4", clips / "a" / "clip2.mp4"]
     options = BatchOptions(retries=0, cores=99)  # one at a time
-    report = run_batch(videos, tmp_path, ReadOptions(), options=options, watch=harm)
+    report = run_batch(videos, tmp_path, ReadOptions(), options=options, on_progress=harm)
     assert (report.num_done, report.failed) == (1, {reason: 1})
 
 

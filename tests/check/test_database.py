@@ -25,7 +25,7 @@ from existing_database import (
 )
 from synthetic_scene import FOCAL, HEIGHT, WIDTH, make_scene, match_scene
 
-from colmap_av1.check.database import CheckReport, check
+from colmap_av1.check.database import DatabaseCheck, check_database
 from colmap_av1.cli import main
 from colmap_av1.database.reading import pair_id_from_image_ids
 from colmap_av1.database.writing import write_matches
@@ -34,7 +34,7 @@ from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.options import CameraOptions
 
 
-def found(report: CheckReport) -> list[tuple[str, str]]:
+def found(report: DatabaseCheck) -> list[tuple[str, str]]:
     return [(finding.severity, finding.text) for finding in report.findings]
 
 
@@ -52,7 +52,7 @@ def maps(path: Path) -> bool:
 def test_new_database(tmp_path: Path) -> None:
     path = tmp_path / "new.db"
     write_matches(path, NAMES, CAMERA, **OURS)
-    report = check(path)
+    report = check_database(path)
     assert (report.layout, report.readers) == ("3.8 or 3.9", "3.8 and later")
     assert report.user_version == 3800
     assert report.num_images == report.num_connected_images == NUM_IMAGES
@@ -78,7 +78,7 @@ def test_new_database(tmp_path: Path) -> None:
 def test_database_of_sift(tmp_path: Path, layout: str) -> None:
     path = tmp_path / "sift.db"
     make_existing(path, layout, "sift")
-    report = check(path)
+    report = check_database(path)
     expected = {
         "3.8": ("3.8 or 3.9", "3.8 and later"),
         "3.11": ("3.10 or 3.11", "3.10 and later"),
@@ -98,7 +98,7 @@ def test_migrated_database(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
     make_existing(path, "3.8", "sift")
     pycolmap.Database.open(path).close()
-    report = check(path)
+    report = check_database(path)
     assert report.layout == "3.8 or 3.9, migrated by 4.x"
     assert report.readers == "3.8, 3.9 and 4.x"
 
@@ -263,10 +263,10 @@ def test_findings(
 ) -> None:
     path = tmp_path / "given.db"
     make_existing(path, "3.13", "sift")
-    before = found(check(path))
+    before = found(check_database(path))
     for sql in changes:
         alter(path, sql)
-    report = check(path)
+    report = check_database(path)
     new = [f for f in found(report) if f not in before]
     assert any(severity == kind and word in text for kind, text in new), new
     assert all("\n" not in text for _, text in new)
@@ -287,7 +287,7 @@ def test_findings(
 def test_little_parallax(tmp_path: Path, arc: float, severity: str) -> None:
     scene = make_scene(num_frames=NUM_IMAGES, num_points=500, noise=0.05, arc_degrees=arc)
     write_matches(tmp_path / "a.db", NAMES, CAMERA, **match_scene(scene, CAMERA))
-    report = check(tmp_path / "a.db")
+    report = check_database(tmp_path / "a.db")
     assert any(kind == severity and "parallax" in text for kind, text in found(report))
     assert report.parallax is not None
     assert report.parallax.angle == pytest.approx(0.75 * arc, rel=0.3)
@@ -297,9 +297,9 @@ def test_configuration_of_a_rig(tmp_path: Path) -> None:
     """Pairs of a calibrated rig have a pose of their essential matrix, as calibrated ones."""
     path = tmp_path / "a.db"
     write_matches(path, NAMES, CAMERA, **OURS)
-    before = check(path)
+    before = check_database(path)
     alter(path, "UPDATE two_view_geometries SET config = 9")
-    report = check(path)
+    report = check_database(path)
     assert report.configs == {"CALIBRATED_RIG": len(OURS["pairs"])}
     assert report.num_used_pairs == before.num_used_pairs
     assert report.parallax is not None
@@ -310,7 +310,7 @@ def test_guessed_focal_length_is_told(tmp_path: Path) -> None:
     guess = make_camera(CameraOptions(), WIDTH, HEIGHT)
     scene = make_scene(num_frames=NUM_IMAGES, num_points=500)
     write_matches(tmp_path / "a.db", NAMES, guess, **match_scene(scene, guess))
-    report = check(tmp_path / "a.db")
+    report = check_database(tmp_path / "a.db")
     assert report.configs.keys() == {"UNCALIBRATED"}
     assert report.parallax is not None
     assert not report.parallax.focal_known
@@ -338,7 +338,7 @@ def test_forward_motion(tmp_path: Path) -> None:
     )
     drive = dataclasses.replace(scene, tracks=tracks)
     write_matches(tmp_path / "a.db", NAMES, CAMERA, **match_scene(drive, CAMERA))
-    texts = [text for _, text in found(check(tmp_path / "a.db"))]
+    texts = [text for _, text in found(check_database(tmp_path / "a.db"))]
     assert any("axis" in text for text in texts)
 
 
@@ -356,7 +356,7 @@ def test_nothing_is_altered(tmp_path: Path, layout: str, journal: str) -> None:
     before = listing(tmp_path)
     time = path.stat().st_mtime_ns
     assert before.keys() == {"given.db"}
-    check(path)
+    check_database(path)
     assert listing(tmp_path) == before
     assert path.stat().st_mtime_ns == time
 
@@ -370,7 +370,7 @@ def test_log_of_another_process_is_read(tmp_path: Path) -> None:
     writer.commit()
     assert path.with_name("given.db-wal").stat().st_size > 0
     before = path.read_bytes()
-    assert check(path).num_images == 5
+    assert check_database(path).num_images == 5
     assert path.read_bytes() == before
     writer.close()
 
@@ -390,7 +390,7 @@ def test_interrupted_write_is_told(tmp_path: Path) -> None:
     assert path.with_name("given.db-journal").stat().st_size > 0
     before = listing(tmp_path)
     with pytest.raises(DatabaseError, match="interrupted"):
-        check(path)
+        check_database(path)
     assert listing(tmp_path) == before
 
 
@@ -410,14 +410,14 @@ def test_what_cannot_be_read(tmp_path: Path) -> None:
         (".", "folder"),
     ):
         with pytest.raises(DatabaseError, match=message) as caught:
-            check(tmp_path / name)
+            check_database(tmp_path / name)
         assert "\n" not in str(caught.value)
     assert not (tmp_path / "absent.db").exists()
 
 
 def test_empty_database_lists_nothing(tmp_path: Path) -> None:
     make_layout(tmp_path / "a.db", "4.2")
-    ((severity, text),) = found(check(tmp_path / "a.db"))
+    ((severity, text),) = found(check_database(tmp_path / "a.db"))
     assert severity == "error"
     assert "images" in text
 
@@ -446,7 +446,7 @@ def test_large_ids(tmp_path: Path) -> None:
         alter(path, f"UPDATE {table} SET image_id = ? WHERE image_id = 2", big)
     for table in ("matches", "two_view_geometries"):
         alter(path, f"UPDATE {table} SET pair_id = ?", pair_id_from_image_ids(1, big))
-    assert check(path).num_used_pairs == 1
+    assert check_database(path).num_used_pairs == 1
 
 
 def two_images() -> dict[str, object]:

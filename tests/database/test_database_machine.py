@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from track_metrics import database_tracks
 
-from colmap_av1.check.database import check
+from colmap_av1.check.database import check_database
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_cameras, read_images
 from colmap_av1.database.writing import write_matches
@@ -196,7 +196,7 @@ class Databases(RuleBasedStateMachine):
     def everything_reads_it(self) -> None:
         if not self.path.exists():  # before it is made
             return
-        self.attempt(lambda: check(self.path))
+        self.attempt(lambda: check_database(self.path))
         self.attempt(lambda: read_images(self.path))
         self.attempt(lambda: read_cameras(self.path))
         self.attempt(lambda: export_hloc(self.path, self.folder / "hloc"))

@@ -27,7 +27,7 @@ from existing_database import (
 )
 from track_metrics import database_tracks
 
-from colmap_av1.check.database import check
+from colmap_av1.check.database import check_database
 from colmap_av1.cli import main
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_cameras, read_images
@@ -208,7 +208,7 @@ SQL = {
 def opened_by_all(path: Path, folder: Path) -> list[tuple[str, Callable[[], object]]]:
     """Everything of the package that opens a database."""
     return [
-        ("check", lambda: check(path)),
+        ("check", lambda: check_database(path)),
         ("images", lambda: read_images(path)),
         ("cameras", lambda: read_cameras(path)),
         ("write", lambda: write_matches(path, NAMES, CAMERA, **OURS, on_existing="append")),
@@ -272,7 +272,7 @@ def test_a_layout_for_which_sqlite_reports_a_lack_of_memory(tmp_path: Path) -> N
     path = tmp_path / "a.db"
     path.write_bytes(content)
     with pytest.raises(DatabaseError, match="damaged"):
-        check(path)
+        check_database(path)
 
 
 def test_nothing_of_the_layout_is_run(tmp_path: Path, sound: bytes) -> None:
@@ -388,7 +388,7 @@ def test_found_by_strict_check(  # noqa: PLR0917
 def test_every_layout_is_read_and_written(tmp_path: Path, layout: str) -> None:
     make_layout(tmp_path / "a.db", layout)
     write_matches(tmp_path / "a.db", NAMES, CAMERA, **OURS)
-    assert check(tmp_path / "a.db").mappable
+    assert check_database(tmp_path / "a.db").mappable
 
 
 def test_large_database_is_no_endless_one(tmp_path: Path) -> None:
@@ -409,5 +409,5 @@ def test_large_database_is_no_endless_one(tmp_path: Path) -> None:
             "INSERT INTO two_view_geometries (pair_id, rows, cols, config) "
             "SELECT pair_id, 0, 2, 1 FROM matches"
         )
-    assert check(path).num_empty_pairs == 300 * 299 // 2
+    assert check_database(path).num_empty_pairs == 300 * 299 // 2
     assert len(read_images(path)) == 300

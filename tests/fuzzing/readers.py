@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from colmap_av1.check.database import check
+from colmap_av1.check.database import check_database
 from colmap_av1.errors import ColmapAv1Error
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.interop.hloc import read_hloc
@@ -49,7 +49,7 @@ def database(data: bytes, folder: Path) -> None:
     """Any bytes as a database."""
     path = folder / "a.db"
     path.write_bytes(data)
-    check(path)
+    check_database(path)
     assert path.read_bytes() == data
 
 

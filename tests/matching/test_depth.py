@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 from synthetic_scene import FOCAL, HEIGHT, WIDTH, Scene, make_scene
 
-from colmap_av1.check.database import check
+from colmap_av1.check.database import check_database
 from colmap_av1.cli import main
 from colmap_av1.errors import DatabaseError, ModelError
 from colmap_av1.map import map_database
@@ -86,7 +86,7 @@ def test_every_command_speaks_of_a_zoom(
     report = match(database, video, image_path=tmp_path / "images", options=OPTIONS)
     (warning,) = [text for text in report.warnings if "depth is not observable" in text]
     assert report.estimate is None
-    assert warning in [f.text for f in check(database).findings if f.severity == "error"]
+    assert warning in [f.text for f in check_database(database).findings if f.severity == "error"]
     with pytest.raises(DatabaseError, match="depth"):
         map_database(database, tmp_path / "images", tmp_path / "model")
     assert not (tmp_path / "model").exists()

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sequences import model_poses
 from synthetic_scene import alignment_error
 
-from colmap_av1.check.database import check
+from colmap_av1.check.database import check_database
 from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.errors import VideoError
 from colmap_av1.geometry.colmap_model import camera_centres
@@ -149,7 +149,8 @@ def test_jerk_is_linked(jerk: Path, linked: MatchReport, tmp_path: Path) -> None
     named = re.search("'frame_(.*).png' and 'frame_(.*).png'", warning)
     assert named is not None
     assert before - 2 < int(named[1]) <= before < int(named[2]) < before + 3
-    assert ("warning", warning) in [(f.severity, f.text) for f in check(linked.database).findings]
+    findings = check_database(linked.database).findings
+    assert ("warning", warning) in [(f.severity, f.text) for f in findings]
     alone = match(tmp_path / "b.db", jerk, options=MatchOptions(links=LinkOptions(links="none")))
     assert alone.links.num_images == 0
     assert report.num_pairs > alone.num_pairs

@@ -11,7 +11,7 @@ import pytest
 from conftest import Encode
 from numpy.typing import NDArray
 
-from colmap_av1.check.database import check
+from colmap_av1.check.database import check_database
 from colmap_av1.match import match
 from colmap_av1.video.decoding import decode_frames
 
@@ -62,7 +62,7 @@ def test_cut_to_what_was_seen_elsewhere_needs_few_features(
     assert report.links.frames_of_gaps("contradicted") == [(24, 25), (54, 55)]
     assert report.links.frames_of_gaps("no overlap") == []
     assert report.links.num_revisits >= 2
-    assert check(tmp_path / "a.db").num_connected_images == 69
+    assert check_database(tmp_path / "a.db").num_connected_images == 69
 
 
 @pytest.mark.slow
@@ -74,7 +74,7 @@ def test_camera_too_fast_for_motion_is_linked(shared: Path, tmp_path: Path) -> N
     assert report.links.frames_of_gaps("no overlap") == []
     assert len(report.links.gaps) == 36
     assert len(report.links.frames_of_gaps("contradicted")) > 12
-    assert check(tmp_path / "a.db").num_connected_images == 37
+    assert check_database(tmp_path / "a.db").num_connected_images == 37
     # No focal length is known, and what the camera flies over is flat.
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
     models = pycolmap.incremental_mapping(tmp_path / "a.db", tmp_path, tmp_path / "model", options)

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from conftest import AV1, Encode, Ffmpeg, make_frames
 
-from colmap_av1.motion.info import inspect
+from colmap_av1.motion.info import read_info
 
 
 def test_good_stream(clip: Path) -> None:
-    report = inspect(clip)
+    report = read_info(clip)
     assert report.good
     assert (report.width, report.height, report.display.rotation) == (192, 128, 0)
     assert (report.num_shown, report.num_coded, report.num_key_frames) == (16, 16, 1)
@@ -26,7 +26,7 @@ def test_good_stream(clip: Path) -> None:
 
 def test_pyramid_references_the_future(encode: Encode, tmp_path: Path) -> None:
     how = ["-c:v", "libaom-av1", "-cpu-used", "8", "-lag-in-frames", "19", "-crf", "20"]
-    report = inspect(encode(make_frames(20), tmp_path / "pyramid.mp4", *how))
+    report = read_info(encode(make_frames(20), tmp_path / "pyramid.mp4", *how))
     assert report.num_shown == 20
     assert max(report.reference_distances) > 0
     assert sum(report.reference_distances.values()) + report.hidden_reference_share == (
@@ -36,7 +36,7 @@ def test_pyramid_references_the_future(encode: Encode, tmp_path: Path) -> None:
 
 def test_rotation_is_reported(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     turned = ffmpeg("-display_rotation", "90", "-i", clip, "-c", "copy", tmp_path / "turned.mp4")
-    assert inspect(turned).display.rotation == 90
+    assert read_info(turned).display.rotation == 90
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_poor_streams(
 ) -> None:
     if reason == "rate":
         how = ["63" if word == "20" else word for word in how]
-    report = inspect(encode(frames, tmp_path / "poor.mp4", *how))
+    report = read_info(encode(frames, tmp_path / "poor.mp4", *how))
     assert not report.good
     assert any(reason in r for r in report.reasons), report.reasons
 
@@ -66,7 +66,7 @@ def test_frames_that_are_there_twice_move_all_the_same(encode: Encode, tmp_path:
     for number, repeats in enumerate(
         (np.repeat(frames, 2, axis=0), frames[[*range(12), *[11] * 14]])
     ):
-        report = inspect(encode(repeats, tmp_path / f"{number}.mp4", *AV1))
+        report = read_info(encode(repeats, tmp_path / f"{number}.mp4", *AV1))
         assert report.median_motion < 0.1
         assert report.good, report.reasons
 
@@ -78,7 +78,9 @@ def test_fast_turns(encode: Encode, tmp_path: Path) -> None:
     wall = cv2.GaussianBlur(rng.integers(0, 255, (128, 1000), np.uint8), (0, 0), 3)
     wall = cv2.normalize(wall, None, 0, 255, cv2.NORM_MINMAX)
     frames = np.array([wall[:, x : x + 192] for x in np.cumsum(steps)])
-    report = inspect(encode(np.repeat(frames[..., None], 3, axis=3), tmp_path / "turns.mp4", *AV1))
+    report = read_info(
+        encode(np.repeat(frames[..., None], 3, axis=3), tmp_path / "turns.mp4", *AV1)
+    )
     assert 0.15 < report.fast_share < 0.25
     assert any("slowly" in reason for reason in report.reasons), report.reasons
 
@@ -89,5 +91,5 @@ def test_a_change_of_size(encode: Encode, tmp_path: Path) -> None:
     other = encode(frames[:, :96, :128].copy(), tmp_path / "other.obu", *AV1)
     both = tmp_path / "both.obu"
     both.write_bytes(one.read_bytes() + other.read_bytes())
-    reasons = inspect(both).reasons
+    reasons = read_info(both).reasons
     assert any("size" in reason and "12" in reason for reason in reasons), reasons

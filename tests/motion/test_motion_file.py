@@ -28,7 +28,7 @@ def check_frame(frame: FrameMotion, stored: dict[str, np.ndarray]) -> None:
 def test_files_hold_every_field_of_every_frame(clip: Path, tmp_path: Path, ending: str) -> None:
     output = tmp_path / f"m.{ending}"
     done: list[int] = []
-    assert export_motion(clip, output, progress=done.append) == 16
+    assert export_motion(clip, output, progress=lambda _, n, total: done.append(n)) == 16
     assert done == list(range(1, 17))
     stored: dict[str, np.ndarray] = {}
     if ending == "npz":

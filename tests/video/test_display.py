@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from colmap_av1.cli import reports
 from colmap_av1.errors import VideoError
 from colmap_av1.match import match
-from colmap_av1.motion.info import inspect
+from colmap_av1.motion.info import read_info
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import (
     CameraOptions,
@@ -176,7 +176,7 @@ def test_cropped_by_the_container(
             pytest.skip("FFmpeg writes no display matrix to Matroska")
         cropped = ffmpeg("-i", cropped, "-c", "copy", tmp_path / "cropped.mkv")
     assert read_video(cropped).display.crop == crop
-    assert inspect(cropped).display.crop == crop
+    assert read_info(cropped).display.crop == crop
     first, *_ = cut_by_ffmpeg(ffmpeg, cropped, tmp_path / "cut", "-frames:v", "1")
     shown = next(decode_frames(cropped))[1]
     assert shown.shape == first.shape == ((160, 114, 3) if angle else (114, 160, 3))
@@ -212,7 +212,7 @@ def test_edit_list_of_a_trimmed_clip(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path)
     presented = read_video(trimmed).presented
     assert presented is not None
     assert presented.tolist() == list(range(5, 16))
-    assert inspect(trimmed).num_cut == 5
+    assert read_info(trimmed).num_cut == 5
     cut = cut_by_ffmpeg(ffmpeg, trimmed, tmp_path / "cut")
     decoded = list(decode_frames(trimmed))
     assert [index for index, _ in decoded] == list(range(len(cut))) == list(range(11))
@@ -300,7 +300,7 @@ def test_oblong_pixels(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, angle: in
 
 
 def info_rows(video: Path) -> list[tuple[str, str]]:
-    return reports.info_rows(inspect(video))
+    return reports.info_rows(read_info(video))
 
 
 def test_images_whose_pixels_were_made_square(

@@ -27,7 +27,7 @@ from colmap_av1.errors import (
     VideoError,
 )
 from colmap_av1.match import match
-from colmap_av1.motion.info import inspect
+from colmap_av1.motion.info import read_info
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import EncodeOptions, MatchOptions
 from colmap_av1.video.decoding import decode_frames
@@ -75,7 +75,7 @@ def test_streams_refer_backwards_only(
     np.testing.assert_allclose(times(report.output), times(phone), atol=2e-3)
     assert [p.name for p in tmp_path.iterdir()] == [f"out.{ending}"]
     # Motion to the frame before is what makes good tracks.
-    assert inspect(report.output).reference_distances[-1] > 0.6
+    assert read_info(report.output).reference_distances[-1] > 0.6
 
 
 def test_speeds_of_libaom_that_ffmpeg_does_not_have(phone: Path, tmp_path: Path) -> None:
@@ -293,7 +293,7 @@ def test_reencode_only_what_is_poor(
 ) -> None:
     how = ("-c:v", "libaom-av1", "-cpu-used", "8", "-g", "1", "-crf", "20")
     intra = encode(make_frames(8), tmp_path / "intra.mp4", *how)
-    assert not inspect(intra).good
+    assert not read_info(intra).good
     words = ["match", "--database", str(tmp_path / "a.db"), "--video", str(intra)]
     # The pictures link what no motion does; a warning says what the stream lacks.
     assert main(words) == 0

@@ -8,7 +8,7 @@ from conftest import Ffmpeg
 
 from colmap_av1 import match
 from colmap_av1.errors import BitstreamError, OptionError, VideoError
-from colmap_av1.motion.info import inspect
+from colmap_av1.motion.info import read_info
 from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions
 from colmap_av1.video.container import packets, read_file
 from colmap_av1.video.facts import frame_times, read_video, with_counted_packets
@@ -31,7 +31,7 @@ def test_a_video_stands_for_its_path(clip: Path) -> None:
     video = read_video(clip)
     assert Path(video) == clip
     assert str(video) == str(clip)
-    assert inspect(video) == inspect(str(clip))
+    assert read_info(video) == read_info(str(clip))
     times = frame_times(video)
     assert times is not None
     assert times.tolist() == [p.pts for p in packets(video)]
@@ -49,7 +49,7 @@ def test_a_container_that_lies_about_its_duration(clip: Path, tmp_path: Path, sa
     assert true is not None
     assert lies is not None
     assert lies.tolist() == true.tolist()
-    assert inspect(path).num_shown == inspect(clip).num_shown == 16
+    assert read_info(path).num_shown == read_info(clip).num_shown == 16
 
 
 def with_long(path: Path, data: bytes, box: bytes, offset: int, value: int) -> Path:
@@ -63,7 +63,7 @@ def with_long(path: Path, data: bytes, box: bytes, offset: int, value: int) -> P
 def test_a_container_whose_time_scale_cannot_be(clip: Path, tmp_path: Path, scale: int) -> None:
     path = with_long(tmp_path / "lies.mp4", clip.read_bytes(), b"mdhd", 12, scale)
     with pytest.warns(UserWarning, match="time scale"):
-        told = inspect(path)
+        told = read_info(path)
     assert (told.num_shown, told.num_cut, told.frame_rate) == (16, 0, None)
     assert frame_times(read_video(path)) is None
     true, lies = match(tmp_path / "a.db", clip), match(tmp_path / "b.db", path)
@@ -86,7 +86,7 @@ def test_an_edit_list_that_shows_nothing(
     """Of no length, or from a time on at which the video is over."""
     path = with_long(tmp_path / "lies.mp4", clip.read_bytes(), b"elst", offset, value)
     with pytest.warns(UserWarning, match="edit list"):
-        told = inspect(path)
+        told = read_info(path)
     assert (told.num_shown, told.num_cut, told.frame_rate) == (16, 0, 25.0)
     true, lies = match(tmp_path / "a.db", clip), match(tmp_path / "b.db", path)
     assert (lies.num_frames, lies.num_matches) == (true.num_frames, true.num_matches)
@@ -97,7 +97,7 @@ def test_an_edit_list_that_shows_nothing(
 def test_a_sample_table_that_points_elsewhere(clip: Path, tmp_path: Path, box: bytes) -> None:
     path = with_long(tmp_path / "lies.mp4", clip.read_bytes(), box, 8 if box == b"stco" else 12, 0)
     with pytest.raises(BitstreamError, match=r"lies\.mp4"):
-        inspect(path)
+        read_info(path)
     with pytest.raises(BitstreamError, match=r"lies\.mp4"):
         match(tmp_path / "a.db", path)
     assert not (tmp_path / "a.db").exists()
@@ -109,7 +109,7 @@ def test_a_container_that_lies_about_its_rate(
 ) -> None:
     scale = str(25 / float(rate))
     path = ffmpeg("-itsscale", scale, "-i", clip, "-c", "copy", tmp_path / "lies.mp4")
-    assert inspect(path).num_shown == 16
+    assert read_info(path).num_shown == 16
     true, lies = match(tmp_path / "a.db", clip), match(tmp_path / "b.db", path)
     assert (lies.num_frames, lies.num_matches) == (true.num_frames, true.num_matches)
 

@@ -18,7 +18,7 @@ from ivf_files import frame_headers, ivf_of, with_repeats
 
 from colmap_av1.cli import main
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
-from colmap_av1.motion.info import inspect
+from colmap_av1.motion.info import read_info
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
 from colmap_av1.video.container import open_stream, packets
@@ -420,7 +420,7 @@ def test_pictures_that_are_shown_again_at_the_end_count(clip: Path, tmp_path: Pa
     """Players show 4 coded pictures and then the first one of them 20 times more."""
     path = with_repeats(clip, tmp_path / "again.ivf", range(4), [(3, 0, 20)])
     assert len(list(decode_frames(path))) == 24
-    report = inspect(path)
+    report = read_info(path)
     assert (report.num_shown, report.num_coded) == (24, 4)
 
 
