@@ -39,6 +39,7 @@ from colmap_av1.poses.run import Run
 from colmap_av1.poses.starting_pair import StartingPair, starting_pair
 from colmap_av1.poses.track_matches import at_same_place, pair_by_tracks, tracks_of_model
 from colmap_av1.poses.track_stage import VideoTracks, pose_tracks
+from colmap_av1.poses.unregistered import models_of_images, tracks_of_unregistered, within_models
 from colmap_av1.tracks.selection import select_tracks, spread_observations
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.spread import evenly_spread
@@ -124,7 +125,8 @@ def match_jointly(
 ) -> JointMatches:
     """Estimate the poses of all images, and match the tracks that agree with them.
 
-    Images that are not registered are matched along all their tracks.
+    Images that are not registered are matched along all their tracks if they belong to a model, see
+    `models_of_images`; otherwise they have no matches.
 
     Args:
         run: inputs and options of the run.
@@ -149,8 +151,9 @@ def match_jointly(
     registered = {image.name for model in models for image in model.placed.images}
     left = [name for name in image_set.images.names if name not in registered]
     with run.clock.measure("pairs"):
-        others = _tracks_of_unregistered(run, posed, image_set, left, density)
-        others = _within_models(others, models, image_set)
+        others = tracks_of_unregistered(run, posed, image_set, left, density)
+        model_of = models_of_images(others, [model.placed.frames for model in models], image_set)
+        others = within_models(others, left, model_of, image_set)
         agreeing = [_agreeing_tracks(model, image_set, others, density) for model in models]
         paired = _paired(run, image_set, agreeing, others, density)
     cameras = _cameras(run, image_set, models)
@@ -165,7 +168,7 @@ def match_jointly(
         link_tracks=posed.links,
         track_lengths=paired.track_lengths,
         depth=matches.depth,
-        warnings=(*matches.link_warnings, *_warnings(models, left, len(image_set.sequence))),
+        warnings=(*matches.link_warnings, *_warnings(models, left, model_of, image_set)),
         estimate=JointEstimate(
             num_registered=tuple(len(model.placed.images) for model in models),
             far_views=far.far_views if far is not None else None,
@@ -421,59 +424,6 @@ def _paired(
     return replace(paired, matches=matches)
 
 
-def _tracks_of_unregistered(
-    run: Run, posed: Posed, image_set: ImageSet, left: Sequence[str], density: DensityOptions
-) -> Tracks:
-    """Motion tracks and SIFT links with observations in images that are not registered.
-
-    Args:
-        run: the run.
-        posed: the first model.
-        image_set: all images.
-        left: names of the images that are not registered.
-        density: which motion tracks are selected.
-    """
-    if not left:
-        return Tracks.empty(posed.tracks.num_frames, (posed.tracks.width, posed.tracks.height))
-    frames, frame_of = image_set.images.frames, image_set.images.frame_of
-    motion = select_tracks(pose_tracks(run, posed.tracks).keep_frames(frames), density)
-    seen = Tracks.concatenate(motion, posed.links.keep_frames(frames))
-    is_left = np.isin(seen.frame, [frame_of[name] for name in left])
-    touching = np.add.reduceat(is_left, seen.offsets[:-1]) > 0
-    return seen.keep_tracks(touching)
-
-
-def _within_models(tracks: Tracks, models: Sequence[_Model], image_set: ImageSet) -> Tracks:
-    """Split tracks so that none connects two models.
-
-    Motion between two models is unreliable. If it were matched, a mapper would join the models at a
-    wrong place. An image that is not registered stays connected to the model of the nearest
-    registered image of its video. Images of videos that have none, and photos, stay connected to
-    the model that they share the most tracks with.
-    """
-    if len(models) == 1 or tracks.num_tracks == 0:
-        return tracks
-    frames = image_set.images.frames
-    model_of = np.full(len(frames), -1)
-    for number, model in enumerate(models):
-        model_of[np.searchsorted(frames, model.placed.frames)] = number
-    image = np.searchsorted(frames, tracks.frame)
-    for sequence in np.unique(image_set.sequence):
-        own = np.flatnonzero(image_set.sequence == sequence)
-        registered = own[model_of[own] >= 0]
-        if len(registered):
-            nearest = np.searchsorted((registered[1:] + registered[:-1]) / 2, own)
-            model_of[own] = model_of[registered[nearest]]
-        else:
-            touching = np.isin(tracks.track, tracks.track[np.isin(image, own)])
-            shared = model_of[image[touching]]
-            model_of[own] = np.bincount(shared[shared >= 0], minlength=1).argmax()
-    of_observation = model_of[image]
-    return Tracks.concatenate(
-        *(tracks.keep_observations(of_observation == number) for number in range(len(models)))
-    )
-
-
 def _cameras(run: Run, image_set: ImageSet, models: Sequence[_Model]) -> list[pycolmap.Camera]:
     """The camera of each image.
 
@@ -533,13 +483,19 @@ def _focal_length(run: Run, camera: pycolmap.Camera) -> float | None:
     return None if given or not camera.has_prior_focal_length else float(camera.focal_length_y)
 
 
-def _warnings(models: Sequence[_Model], left: Sequence[str], num_images: int) -> list[str]:
+def _warnings(
+    models: Sequence[_Model],
+    left: Sequence[str],
+    model_of: NDArray[np.int64],
+    image_set: ImageSet,
+) -> list[str]:
     """Warnings about the estimate.
 
     Args:
         models: the models.
         left: names of the images that are not registered.
-        num_images: number of all images.
+        model_of: see `models_of_images`.
+        image_set: all images.
     """
     warnings = []
     if len(models) > 1:
@@ -551,10 +507,20 @@ def _warnings(models: Sequence[_Model], left: Sequence[str], num_images: int) ->
             f"hardly any points connect {len(models)} parts of the images, which are matched "
             f"separately: {parts}; a mapper makes a model of each, not always the largest first"
         )
-    if left:
+    num_images = len(model_of)
+    belongs = dict(zip(image_set.images.names, (model_of >= 0).tolist(), strict=True))
+    moved = [name for name in left if belongs[name]]
+    alone = [name for name in left if not belongs[name]]
+    if moved:
         warnings.append(
-            f"{len(left)} of {num_images} images are not registered in the joint estimate and are "
-            f"matched by motion alone: {some_names(left)}"
+            f"{len(moved)} of {num_images} images are not registered in the joint estimate and are "
+            f"matched by motion alone: {some_names(moved)}"
+        )
+    if alone:
+        warnings.append(
+            f"{len(alone)} of {num_images} images are not registered in the joint estimate and "
+            f"have no matches: {some_names(alone)}; --verify pairs matches them by motion alone, "
+            "which may bend models"
         )
     if models[0].adjusted.seams_warning is not None:
         warnings.append(models[0].adjusted.seams_warning)

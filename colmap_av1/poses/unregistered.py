@@ -1,0 +1,104 @@
+"""Matches of images that the joint estimate does not register."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.images.image_set import ImageSet
+from colmap_av1.options import DensityOptions
+from colmap_av1.poses.estimate import Posed
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import pose_tracks
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import Tracks
+
+# Up to this many consecutive images that are not registered belong to the model around them.
+_LONGEST_GAP = 3
+
+
+def tracks_of_unregistered(
+    run: Run, posed: Posed, image_set: ImageSet, left: Sequence[str], density: DensityOptions
+) -> Tracks:
+    """Motion tracks and SIFT links with observations in images that are not registered.
+
+    Args:
+        run: the run.
+        posed: the first model.
+        image_set: all images.
+        left: names of the images that are not registered.
+        density: which motion tracks are selected.
+    """
+    if not left:
+        return Tracks.empty(posed.tracks.num_frames, (posed.tracks.width, posed.tracks.height))
+    frames, frame_of = image_set.images.frames, image_set.images.frame_of
+    motion = select_tracks(pose_tracks(run, posed.tracks).keep_frames(frames), density)
+    seen = Tracks.concatenate(motion, posed.links.keep_frames(frames))
+    is_left = np.isin(seen.frame, [frame_of[name] for name in left])
+    touching = np.add.reduceat(is_left, seen.offsets[:-1]) > 0
+    return seen.keep_tracks(touching)
+
+
+def within_models(
+    tracks: Tracks, left: Sequence[str], model_of: NDArray[np.int64], image_set: ImageSet
+) -> Tracks:
+    """Split tracks so that none connects two models or leads to images that belong to none.
+
+    Args:
+        tracks: tracks with observations in images that are not registered.
+        left: names of the images that are not registered.
+        model_of: see `models_of_images`.
+        image_set: all images.
+
+    Returns:
+        The parts of the tracks in the images of each model that observe an image of `left`.
+    """
+    image = np.searchsorted(image_set.images.frames, tracks.frame)
+    is_left = np.isin(image_set.images.names, left)[image]
+    parts = [Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))]
+    for number in range(int(model_of.max()) + 1):
+        in_model = model_of[image] == number
+        touching = np.isin(tracks.track, tracks.track[in_model & is_left])
+        parts.append(tracks.keep_observations(in_model & touching))
+    return Tracks.concatenate(*parts)
+
+
+def models_of_images(
+    tracks: Tracks, registered: Sequence[NDArray[np.int32]], image_set: ImageSet
+) -> NDArray[np.int64]:
+    """The model that each image belongs to, whether it is registered or not.
+
+    Where the estimate does not register images, motion is unreliable. If it were matched there, a
+    mapper would make bent models of these images, or join models at a wrong place. Therefore, only
+    a few consecutive images belong to the model around them, or next to them at an end of the
+    video. Images of videos without registered images, and photos, belong to the model that they
+    share the most tracks with.
+
+    Args:
+        tracks: tracks with observations in images that are not registered.
+        registered: for each model, the frames of its registered images.
+        image_set: all images.
+
+    Returns:
+        int64 [num_images], -1 for images that belong to no model.
+    """
+    frames = image_set.images.frames
+    model_of = np.full(len(frames), -1)
+    for number, own_frames in enumerate(registered):
+        model_of[np.searchsorted(frames, own_frames)] = number
+    image = np.searchsorted(frames, tracks.frame)
+    for sequence in np.unique(image_set.sequence):
+        own = np.flatnonzero(image_set.sequence == sequence)
+        posed, left = own[model_of[own] >= 0], own[model_of[own] < 0]
+        if len(posed):
+            gap = np.searchsorted(posed, left)
+            around = model_of[posed[[0, *range(len(posed)), -1]]]
+            is_within = (around[gap] == around[gap + 1]) & (np.bincount(gap)[gap] <= _LONGEST_GAP)
+            model_of[left] = np.where(is_within, around[gap], -1)
+        else:
+            touching = np.isin(tracks.track, tracks.track[np.isin(image, own)])
+            shared = model_of[image[touching]]
+            model_of[own] = np.bincount(shared[shared >= 0], minlength=1).argmax()
+    return model_of
