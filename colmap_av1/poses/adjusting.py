@@ -74,6 +74,7 @@ def adjust_posed(
     loss_scales: Sequence[float] = LOSS_SCALES,
     max_steps: int = ADJUSTMENT_STEPS,
     tolerance: float = ADJUSTMENT_TOLERANCE,
+    iterative: bool = False,
 ) -> Adjusted:
     """Bundle-adjust a model with the options of the run, see `adjust_model`.
 
@@ -86,6 +87,7 @@ def adjust_posed(
         loss_scales: see `adjust_model`.
         max_steps: see `adjust_model`.
         tolerance: see `adjust_model`.
+        iterative: see `adjust_model`.
 
     Returns:
         The adjusted model, without observations behind their camera and without points that are
@@ -108,6 +110,7 @@ def adjust_posed(
             log=run.stages / log,
             max_steps=max_steps,
             tolerance=tolerance,
+            iterative=iterative,
         )
         found = read_model(folder)
     images = posed_images(found)

@@ -285,6 +285,7 @@ def _adjusted(
         moved=posed.dynamic.digest if posed.dynamic is not None and moving else None,
         follow=partial(follow_behind, run, moving) if follows else None,
         corners=partial(corners_in_images, run, moving) if has_picture_positions else None,
+        is_fast=bool(posed.matches.result.links.fast),
         number=number,
     )
 

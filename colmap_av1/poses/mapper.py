@@ -165,6 +165,7 @@ def adjust_model(
     log: Path,
     max_steps: int = ADJUSTMENT_STEPS,
     tolerance: float = ADJUSTMENT_TOLERANCE,
+    iterative: bool = False,
 ) -> None:
     """Bundle-adjust poses, points and, optionally, intrinsics of a model, which is overwritten.
 
@@ -179,6 +180,8 @@ def adjust_model(
         max_steps: largest number of iterations of each adjustment.
         tolerance: function tolerance of the last adjustment: smallest relative decrease of the cost
             per iteration.
+        iterative: solve the linear systems by conjugate gradients, whose time grows with the number
+            of observations only. If the scale is poorly determined they take longer.
 
     Raises:
         ModelError: the adjustment failed; the log holds the details.
@@ -194,6 +197,7 @@ def adjust_model(
         "max_num_iterations": max_steps,
         "function_tolerances": tolerances,
         "most_dense_images": _MAX_DENSE_IMAGES,
+        "iterative": iterative,
         "late_trust_radius": _LATE_TRUST_RADIUS,
     }
     _run_in_process(settings, None, log, failed="COLMAP's adjustment", hint="--adjust 0 skips it")

@@ -102,6 +102,9 @@ def _adjust(settings: dict[str, Any]) -> None:
     options.refine_extra_params = settings["refine_intrinsics"]
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.max_num_images_direct_dense_cpu_solver = settings["most_dense_images"]
+    if settings["iterative"]:  # the solver is iterative beyond both limits
+        options.ceres.max_num_images_direct_dense_cpu_solver = 1
+        options.ceres.max_num_images_direct_sparse_cpu_solver = 2
     solver = options.ceres.solver_options
     solver.num_threads = settings["num_threads"]
     solver.max_num_iterations = settings["max_num_iterations"]

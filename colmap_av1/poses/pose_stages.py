@@ -70,6 +70,10 @@ _ADJUSTED = DensityOptions(
 # twenty images by three times as much as over three, which bends the model.
 _NTH_WITH_CORNERS = 2
 _LENGTH_WITH_CORNERS = 8
+# From this many images on, an iterative solver is faster if the scale is well determined: it takes
+# 10 instead of 20 CPU s for 300 images, with the same accuracy. In walks with fast turns it takes
+# three times as long as a direct one.
+_ITERATIVE_IMAGES = 200
 # The selection of tracks for resection, and the fewest views of a point by key images.
 _RESECTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=16.0, min_images=3, max_sigma=0.0
@@ -333,6 +337,7 @@ def adjustment_stage(
     moved: str | None = None,
     follow: Callable[[Tracks, PosedImages], Tracks] | None = None,
     corners: Callable[[Tracks, PosedImages], tuple[Tracks, PosedImages]] | None = None,
+    is_fast: bool = False,
     number: int = 1,
 ) -> Kept[AdjustedResult]:
     """Bundle-adjust the poses with a robust loss, on long tracks that cover the images evenly.
@@ -351,6 +356,7 @@ def adjustment_stage(
         follow: refines the selected tracks in the registered images.
         corners: finds corners in the pictures of the registered images, and corrects poses that
             contradict them.
+        is_fast: the camera turns fast somewhere, so that the scale may be poorly determined.
         number: number of the mapping that the poses come from.
     """
     options = run.options
@@ -376,7 +382,8 @@ def adjustment_stage(
             check_agreement(sum(len(own.xyz) for own in points), spread.num_tracks)
             run.progress("adjustment", 0, 1)
             model = PosedModel(placed.cameras, placed.images, joined_points(points))
-            adjusted = adjust_posed(run, model)
+            iterative = len(model.images) >= _ITERATIVE_IMAGES and not is_fast
+            adjusted = adjust_posed(run, model, iterative=iterative)
             run.progress("adjustment", 1, 1)
             model = adjusted.model
             with tempfile.TemporaryDirectory() as name:

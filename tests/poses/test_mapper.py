@@ -96,7 +96,10 @@ def adjusted_model(made: ReconstructReport, folder: Path) -> pycolmap.Reconstruc
     return read_model(folder)
 
 
-def test_adjustment_mends_poses(made: ReconstructReport, truth: Truth, tmp_path: Path) -> None:
+@pytest.mark.parametrize("iterative", [False, True])
+def test_adjustment_mends_poses(
+    made: ReconstructReport, truth: Truth, tmp_path: Path, iterative: bool
+) -> None:
     model = adjusted_model(made, tmp_path)
     rng = np.random.default_rng(0)
     for frame in model.frames.values():
@@ -113,6 +116,7 @@ def test_adjustment_mends_poses(made: ReconstructReport, truth: Truth, tmp_path:
         seed=0,
         num_threads=1,
         log=tmp_path / "log",
+        iterative=iterative,
     )
     adjusted = read_model(tmp_path)
     errors = pose_errors(model_poses(adjusted, 60), truth.cam_from_world)
