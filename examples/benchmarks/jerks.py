@@ -123,7 +123,7 @@ class Row:
     images: int
     registered: int
     ate: float | None
-    said: str
+    warnings: str
 
 
 def main() -> int:
@@ -225,7 +225,7 @@ def try_place(
     )
     rows = []
     for way in ways:
-        made, said = way_of(way, whole, clip, folder)
+        made, warnings = way_of(way, whole, clip, folder)
         num_registered, ate = figures(whole.poses, made, kept)
         row = Row(
             place=place,
@@ -238,7 +238,7 @@ def try_place(
             images=len(kept),
             registered=num_registered,
             ate=ate,
-            said="; ".join(said),
+            warnings="; ".join(warnings),
         )
         rows.append(row)
     return rows
@@ -320,11 +320,11 @@ def way_of(way: str, whole: Whole, clip: Path, folder: Path) -> tuple[Any | None
     run = run_reconstruct if way == "reconstruct" else run_match
     try:
         given = (clip, output, whole.camera, whole.forward_motion)
-        said = run_measured(run, *given, log=folder / "log").result
+        warnings = run_measured(run, *given, log=folder / "log").result
     except ColmapAv1Error as error:
         return None, [str(error)]
     model = "sparse/0" if way == "reconstruct" else "models/0"
-    return read_model(output / model), said
+    return read_model(output / model), warnings
 
 
 def run_reconstruct(clip: Path, output: Path, camera: CameraOptions, _: bool) -> list[str]:

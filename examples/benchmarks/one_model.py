@@ -73,7 +73,7 @@ class Row:
         between: number of SIFT links between videos.
         links_cpu_s: CPU seconds of SIFT links and loop closures.
         cpu_s: total CPU seconds.
-        said: warnings about disconnected images.
+        warnings: warnings about disconnected images.
     """
 
     case: str
@@ -86,7 +86,7 @@ class Row:
     between: int
     links_cpu_s: float
     cpu_s: float
-    said: str
+    warnings: str
 
 
 def main() -> int:
@@ -139,7 +139,7 @@ def measure(case: str, cache: Path, console: Console) -> Row:
         between=report.links.num_between,
         links_cpu_s=report.cpu_seconds.get("links", 0.0),
         cpu_s=run.cpu_seconds,
-        said="; ".join(report.warnings),
+        warnings="; ".join(report.warnings),
     )
 
 

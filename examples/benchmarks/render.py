@@ -417,6 +417,9 @@ def jerks(rows: list[Row]) -> str:
     def errors(own: list[Row]) -> list[float]:
         return sorted(float(row["ate"]) for row in own if row["ate"])
 
+    def warned(row: Row) -> bool:
+        return bool(row["warnings"])
+
     def straight(row: Row) -> bool:
         return bool(row["ate"]) and float(row["ate"]) <= STRAIGHT
 
@@ -440,10 +443,10 @@ def jerks(rows: list[Row]) -> str:
         words("sequence, way", "sequence", "way"),
         count("clips", lambda _: True),
         count("whole and straight", lambda row: whole(row) and straight(row)),
-        count("of these, warned", lambda row: whole(row) and straight(row) and bool(row["said"])),
+        count("of these, warned", lambda row: whole(row) and straight(row) and warned(row)),
         count("parts straight, warned", lambda row: not whole(row) and straight(row)),
-        count("bent or none, warned", lambda row: not straight(row) and bool(row["said"])),
-        count("bent, not warned", lambda row: not straight(row) and not row["said"]),
+        count("bent or none, warned", lambda row: not straight(row) and warned(row)),
+        count("bent, not warned", lambda row: not straight(row) and not warned(row)),
         error("median error of centres", 0.5),
         error("largest", 1.0),
     ]
