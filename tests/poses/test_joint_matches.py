@@ -14,6 +14,7 @@ import pycolmap
 import pytest
 from databases import keypoints_of
 from dense_scene import SCENE, Truth
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from sequences import model_poses
 
@@ -35,7 +36,7 @@ from colmap_av1.options import (
 from colmap_av1.poses.starting_pair import starting_pair
 from colmap_av1.video.decoding import decode_frames
 
-EVERY = 3
+EVERY = 5
 OPTIONS = MatchOptions(images=ImageOptions(every=EVERY))
 
 
@@ -52,6 +53,10 @@ def mapped(database: Path, images: Path) -> pycolmap.Reconstruction:
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, num_threads=1)
     pycolmap.incremental_mapping(copy, images, output, options=options)
     return read_model(output / "0")
+
+
+def smaller(picture: NDArray[np.uint8], size: float) -> NDArray[np.uint8]:
+    return cv2.resize(picture, None, fx=size, fy=size, interpolation=cv2.INTER_AREA)
 
 
 def num_keypoints(database: Path) -> dict[str, int]:
@@ -141,8 +146,7 @@ def test_images_of_half_the_size(joint: MatchReport, truth: Truth, tmp_path: Pat
     halves.mkdir()
     for path in joint.image_path.iterdir():
         picture = cv2.imread(str(path))
-        half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        cv2.imwrite(str(halves / f"half_{path.name}"), half)
+        cv2.imwrite(str(halves / f"half_{path.name}"), smaller(picture, 0.5))
     report = match(tmp_path / "a.db", SCENE, image_path=halves, options=OPTIONS)
     assert report.estimate is not None
     assert report.estimate.num_registered == (joint.num_images,)
@@ -185,7 +189,7 @@ def test_nothing_is_left_beside_the_database(joint: MatchReport) -> None:
 @pytest.mark.parametrize("count", [13, 8])
 def test_two_scenes(count: int, encode: Callable[..., Path], tmp_path: Path) -> None:
     """An estimate has a model of each scene, the larger first; one of few images has none."""
-    pictures = [picture for _, picture in decode_frames(SCENE)]
+    pictures = [smaller(picture, 0.75) for _, picture in decode_frames(SCENE)]
     videos = [
         encode(np.stack([p[:, ::-1] for p in pictures[40 : 40 + count]]), tmp_path / "one.mp4"),
         encode(np.stack(pictures[:18]), tmp_path / "two.mp4"),
