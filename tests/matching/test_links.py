@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from conftest import PROJECT, Encode, make_frames
+from conftest import PROJECT, QUICK_AV1, Encode, make_frames
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -50,13 +50,38 @@ def pictures(video: Path = SCENE) -> list[NDArray[np.uint8]]:
 
 
 @pytest.fixture(scope="module")
-def jerk(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def halved() -> NDArray[np.uint8]:
+    """The pictures of the rendered clip at half their size."""
+    halves = [cv2.resize(p, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for p in pictures()]
+    return np.array(halves)
+
+
+@pytest.fixture(scope="module")
+def steady(
+    halved: NDArray[np.uint8], encode: Encode, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A part of the rendered clip."""
+    return encode(halved[:36], tmp_path_factory.mktemp("steady") / "steady.mp4", *QUICK_AV1)
+
+
+@pytest.fixture(scope="module")
+def jerk(
+    halved: NDArray[np.uint8], encode: Encode, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """The rendered clip without some frames in its middle."""
-    return encode(_without(LEFT_OUT), tmp_path_factory.mktemp("jerk") / "jerk.mp4")
+    return encode(_without(halved, LEFT_OUT), tmp_path_factory.mktemp("jerk") / "jerk.mp4")
 
 
-def _without(left_out: range) -> NDArray[np.uint8]:
-    return np.array([image for i, image in enumerate(pictures()) if i not in left_out])
+@pytest.fixture(scope="module")
+def far_jerk(
+    halved: NDArray[np.uint8], encode: Encode, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """The rendered clip without more frames."""
+    return encode(_without(halved, FAR_OUT), tmp_path_factory.mktemp("far") / "jerk.mp4")
+
+
+def _without(frames: NDArray[np.uint8], left_out: range) -> NDArray[np.uint8]:
+    return np.delete(frames, left_out, axis=0)
 
 
 def test_features_agree_with_the_truth() -> None:
@@ -162,13 +187,13 @@ def test_links_are_the_same_each_time(jerk: Path, linked: MatchReport, tmp_path:
 
 
 def test_nothing_is_decoded_where_motion_connects_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    steady: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object, **__: object) -> Iterator[None]:
         raise AssertionError("a picture is decoded")
 
     monkeypatch.setattr("colmap_av1.images.image_set.decodable_frames", refuse)
-    report = match(tmp_path / "a.db", SCENE)
+    report = match(tmp_path / "a.db", steady)
     assert report.links.num_images == 0
 
 
@@ -188,7 +213,7 @@ def test_drive_whose_motion_is_rigid_needs_no_pictures(
 
 
 def test_gaps_that_only_seem_weak_need_few_pictures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    steady: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def seeming(
         _: object, frames: NDArray[np.int32], *, certain: bool = False
@@ -196,21 +221,21 @@ def test_gaps_that_only_seem_weak_need_few_pictures(
         return (np.arange(len(frames) - 1) == 20) & (not certain)
 
     monkeypatch.setattr("colmap_av1.matching.gaps.low_inter_gaps", seeming)
-    report = match(tmp_path / "a.db", SCENE)
+    report = match(tmp_path / "a.db", steady)
     assert report.links.num_images == 4
     assert report.links.gaps == ()
     assert report.links.num_links == 0
-    match(tmp_path / "b.db", SCENE, options=MatchOptions(links=LinkOptions(links="none")))
+    match(tmp_path / "b.db", steady, options=MatchOptions(links=LinkOptions(links="none")))
     assert (tmp_path / "a.db").read_bytes() == (tmp_path / "b.db").read_bytes()
 
 
 def test_jerk_that_seems_ordinary_is_linked(
-    encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    far_jerk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where the share of inter units tells little, few pictures contradict the motion."""
     monkeypatch.setattr("colmap_av1.matching.gaps._LEAST_INTER_SHARE", 0.001)
     monkeypatch.setattr("colmap_av1.matching.gaps._CERTAINLY_LESS", 0.0)
-    report = match(tmp_path / "a.db", encode(_without(FAR_OUT), tmp_path / "jerk.mp4"))
+    report = match(tmp_path / "a.db", far_jerk)
     before = FAR_OUT.start - 1
     assert report.links.frames_of_gaps() == [(before, before + 1)]
     assert report.links.num_images > 4
@@ -227,24 +252,23 @@ def test_jerk_bends_no_model(jerk: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_jerk_that_only_the_model_shows(
-    encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    far_jerk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where few points join the images at a jerk, pictures are matched there and all is mapped."""
-    jerk = encode(_without(FAR_OUT), tmp_path / "jerk.mp4")
     monkeypatch.setattr("colmap_av1.matching.gaps._LEAST_INTER_SHARE", 0.001)
     monkeypatch.setattr("colmap_av1.matching.gaps._LEAST_OF_NEIGHBOURS", 0.0)
-    made = reconstruct(jerk, tmp_path / "out", options=ReconstructOptions())
+    made = reconstruct(far_jerk, tmp_path / "out", options=ReconstructOptions())
     before = FAR_OUT.start - 1
     assert [gap.frames for gap in made.links.gaps] == [(before, before + 1)]
     assert made.warnings == ()
     _check_poses(made, FAR_OUT, 0.0005)
-    again = reconstruct(jerk, tmp_path / "out", options=ReconstructOptions())
+    again = reconstruct(far_jerk, tmp_path / "out", options=ReconstructOptions())
     assert set(again.resumed) >= {"tracks", "matches", "poses", "adjustment", "model"}
     assert again.links == made.links
 
     # Without links corners that are found again across it hold the model together.
     without = ReconstructOptions(match=MatchOptions(links=LinkOptions(links="none")))
-    held = reconstruct(jerk, tmp_path / "held", options=without)
+    held = reconstruct(far_jerk, tmp_path / "held", options=without)
     assert held.warnings == ()
     _check_poses(held, FAR_OUT, 0.0005)
 
