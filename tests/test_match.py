@@ -165,20 +165,27 @@ def test_tracks_match_the_pictures(clip: Path, tmp_path: Path) -> None:
             assert np.mean(right & (np.abs(step[:, 1]) < 0.5)) > 0.9
 
 
+@pytest.fixture(scope="module")
+def plain(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a database of all tracks of the clip, and its images."""
+    folder = tmp_path_factory.mktemp("plain")
+    match(folder / "plain.db", clip, image_path=folder / "images", options=ALL)
+    return folder
+
+
 @pytest.mark.parametrize("angle", [90, 180, 270])
-def test_rotated_clips(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, angle: int) -> None:
+def test_rotated_clips(clip: Path, plain: Path, ffmpeg: Ffmpeg, tmp_path: Path, angle: int) -> None:
     turned = ffmpeg("-display_rotation", str(angle), "-i", clip, "-c", "copy", tmp_path / "t.mp4")
-    match(tmp_path / "plain.db", clip, image_path=tmp_path / "plain", options=ALL)
     match(tmp_path / "turned.db", turned, image_path=tmp_path / "turned", options=ALL)
     size = (128, 192) if angle in (90, 270) else (192, 128)
     assert tables(tmp_path / "turned.db")["cameras"][0][2:4] == size
     # Keypoint by keypoint, at the place to which its pixel was turned.
     turned_xy = keypoints_of(tmp_path / "turned.db")
-    for name, xy in keypoints_of(tmp_path / "plain.db").items():
+    for name, xy in keypoints_of(plain / "plain.db").items():
         x, y = xy.T
         wanted = {90: (y, 192 - x), 180: (192 - x, 128 - y), 270: (128 - y, x)}[angle]
         np.testing.assert_allclose(turned_xy[name], np.stack(wanted, axis=1), atol=1e-4)
-    for path in (tmp_path / "plain").iterdir():
+    for path in (plain / "images").iterdir():
         image = cv2.imread(str(tmp_path / "turned" / path.name))
         np.testing.assert_array_equal(image, np.rot90(cv2.imread(str(path)), angle // 90))
 
@@ -323,6 +330,7 @@ def test_image_folder_of_another_size(clip: Path, encode: Encode, tmp_path: Path
 def test_another_run_writes_to_the_same_folder_meanwhile(
     clip: Path, encode: Encode, tmp_path: Path
 ) -> None:
+    pairs = MatchOptions(verify=PAIRS)
     other = encode(make_frames(16)[:, ::-1, ::-1].copy(), tmp_path / "other.mp4")
     images = tmp_path / "images"
 
@@ -332,18 +340,28 @@ def test_another_run_writes_to_the_same_folder_meanwhile(
 
         def progress(now: str, *_: object) -> None:
             if now == stage and waiting:
-                match(tmp_path / "beside.db", waiting.pop(), image_path=images)
+                match(tmp_path / "beside.db", waiting.pop(), image_path=images, options=pairs)
 
         return progress
 
     with pytest.raises(ImageError, match="another"):
-        match(tmp_path / "a.db", clip, image_path=images, progress=match_beside(other, "motion"))
+        match(
+            tmp_path / "a.db",
+            clip,
+            image_path=images,
+            options=pairs,
+            progress=match_beside(other, "motion"),
+        )
     assert not (tmp_path / "a.db").exists()
     shutil.rmtree(images)
     (tmp_path / "beside.db").unlink()
     # Two runs of one video agree.
     report = match(
-        tmp_path / "a.db", clip, image_path=images, progress=match_beside(clip, "motion")
+        tmp_path / "a.db",
+        clip,
+        image_path=images,
+        options=pairs,
+        progress=match_beside(clip, "motion"),
     )
     assert (report.num_images, report.num_written_images) == (16, 0)
 
