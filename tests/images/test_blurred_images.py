@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import PROJECT, SHARED, Encode
+from conftest import PROJECT, QUICK_AV1, SHARED, Encode
 from numpy.typing import NDArray
 
 from colmap_av1.images.files import blur_warning
@@ -83,7 +83,8 @@ def test_sequences_are_sharp(name: str) -> None:
 def test_match_tells_of_images_that_it_writes(
     sharp: list[NDArray[np.uint8]], encode: Encode, tmp_path: Path
 ) -> None:
-    video = encode(np.array([gaussian(picture) for picture in sharp]), tmp_path / "blurred.mp4")
+    blurred = [cv2.resize(gaussian(p), None, fx=0.5, fy=0.5) for p in sharp]
+    video = encode(np.array(blurred), tmp_path / "blurred.mp4", *QUICK_AV1)
     options = MatchOptions(images=ImageOptions(every=1))
     report = match(tmp_path / "a.db", video, image_path=tmp_path / "images", options=options)
     assert any("the images are blurred" in warning for warning in report.warnings)

@@ -291,7 +291,7 @@ def test_a_folder_in_which_pictures_repeat(clip: Path, ffmpeg: Ffmpeg, tmp_path:
     num_files = len(list(folder.iterdir()))
     assert num_files > 16
     with pytest.warns(UserWarning, match=f"{num_files - 16} images"):
-        report = match(tmp_path / "a.db", clip, image_path=folder)
+        report = match(tmp_path / "a.db", clip, image_path=folder, options=DENSE)
     assert (report.num_images, report.num_written_images) == (16, 0)
     assert len(list(folder.iterdir())) == num_files
 
@@ -302,7 +302,7 @@ def test_images_of_a_folder_that_may_not_be_written(
     folder = save(tmp_path / "cut", cut)
     access = os.access
     monkeypatch.setattr(os, "access", lambda path, mode: path != folder and access(path, mode))
-    assert match(tmp_path / "a.db", clip, image_path=folder).num_images == 16
+    assert match(tmp_path / "a.db", clip, image_path=folder, options=DENSE).num_images == 16
     empty = save(tmp_path / "empty", ())
     monkeypatch.setattr(os, "access", lambda path, mode: path != empty and access(path, mode))
     with pytest.raises(ImageError, match="permission"):
