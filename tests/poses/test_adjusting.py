@@ -30,7 +30,7 @@ from colmap_av1.reconstruct import ReconstructReport
 
 
 def points_seen_in(views: list[list[int]]) -> ModelPoints:
-    """A point for each list of images."""
+    """One point for each list of images that see it."""
     lengths = [len(own) for own in views]
     return ModelPoints(
         np.zeros((len(views), 3)),
@@ -46,7 +46,9 @@ def points_seen_in(views: list[list[int]]) -> ModelPoints:
     st.lists(st.tuples(st.integers(0, 30), st.integers(2, 60)), min_size=1, max_size=80),
     st.integers(1, 30),
 )
-def test_points_and_images_keep_enough(stretches: list[tuple[int, int]], mean: int) -> None:
+def test_thinning_keeps_a_minimum_per_point_and_image(
+    stretches: list[tuple[int, int]], mean: int
+) -> None:
     points = points_seen_in([list(range(first, first + count)) for first, count in stretches])
     num_images = int(points.image.max()) + 1
     used = used_observations(points, num_images, mean)
@@ -61,7 +63,7 @@ def test_points_and_images_keep_enough(stretches: list[tuple[int, int]], mean: i
         assert used.all()
 
 
-def test_many_observations_are_thinned_evenly() -> None:
+def test_observations_are_thinned_evenly_over_images() -> None:
     points = points_seen_in([list(range(200))] * 1000)
     used = used_observations(points, 200, 250)
     in_images = np.bincount(points.image[used])
@@ -78,7 +80,7 @@ def test_points_with_one_observation_are_dropped() -> None:
     assert left.image.tolist() == [0, 1, 2, 3, 4]
 
 
-def test_turns_determine_the_focal_length_and_a_straight_path_does_not() -> None:
+def test_focal_length_is_observable_with_turns_but_not_on_a_straight_path() -> None:
     rng = np.random.default_rng(0)
     xyz = rng.uniform(-1, 1, (4000, 3)) * [8, 3, 40]
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 500.0, 640, 480)
@@ -106,11 +108,11 @@ def test_turns_determine_the_focal_length_and_a_straight_path_does_not() -> None
         several = keep_observations(points, np.repeat(counts >= 3, counts))[0]
         errors[turn] = focal_length_errors(PosedModel({1: camera}, images, several))[1]
     assert errors[6.0] < 0.005
-    # It is infinite, unless rounding errors make it finite.
+    # Infinite in exact arithmetic; rounding may make it finite.
     assert errors[0.0] > 0.1
 
 
-def test_half_of_the_observations_determine_the_poses(
+def test_adjustment_recovers_poses_from_half_of_the_observations(
     made: ReconstructReport, truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = posed_model(read_model(made.output / "sparse" / "0"), with_points=True)
@@ -118,7 +120,7 @@ def test_half_of_the_observations_determine_the_poses(
     mean = len(some.image) / len(model.images) / 2
     monkeypatch.setattr(adjusting, "OBSERVATIONS", mean)
     assert not used_observations(some, len(model.images), mean).all()
-    # The moved images and points have larger errors than the first scale of the loss.
+    # These shifts cause errors above the first scale of the robust loss.
     rng = np.random.default_rng(0)
     shifts = np.zeros((len(model.images), 3, 4))
     shifts[:, :, 3] = rng.normal(0, 0.01, (len(model.images), 3))

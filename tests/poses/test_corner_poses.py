@@ -1,4 +1,4 @@
-"""Images that their corners contradict are placed anew, the others stay."""
+"""Images whose corners contradict their pose are resected; the others keep their pose."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WRONG = 4
 
 
 def scene() -> tuple[PosedImages, Tracks]:
-    """Images along a path with exact poses, and corners that see points with a little noise."""
+    """Images along a path with exact poses, and corner tracks with 0.1 px of noise."""
     rng = np.random.default_rng(3)
     camera = pycolmap.Camera(
         camera_id=1, model="SIMPLE_PINHOLE", width=640, height=480, params=[FOCAL, 320, 240]
@@ -68,7 +68,7 @@ def scene() -> tuple[PosedImages, Tracks]:
 RUN = cast(Any, SimpleNamespace(options=ReconstructOptions()))
 
 
-def test_an_image_that_is_off_comes_to_where_its_corners_are() -> None:
+def test_wrong_pose_is_corrected_from_corners() -> None:
     placed, corners = scene()
     true = placed.images[WRONG].cam_from_world
     turned = Rotation.from_euler("xyz", [0.4, 0.7, 0.2], degrees=True).as_matrix() @ true
@@ -76,13 +76,13 @@ def test_an_image_that_is_off_comes_to_where_its_corners_are() -> None:
     images[WRONG] = replace(images[WRONG], cam_from_world=turned)
     found = resect_from_corners(RUN, corners, replace(placed, images=images))
     for image, right in zip(found.images, placed.images, strict=True):
-        # In pixels at the picture's centre and edges.
+        # Rotation error in pixels.
         off = np.abs(image.cam_from_world[:, :3] - right.cam_from_world[:, :3]).max() * FOCAL
         assert off < 0.3, image.name
     assert np.abs(turned - true).max() * FOCAL > 3
 
 
-def test_without_corners_all_stays() -> None:
+def test_poses_are_unchanged_without_corners() -> None:
     placed, corners = scene()
     none = replace(
         corners,
@@ -95,11 +95,11 @@ def test_without_corners_all_stays() -> None:
     assert resect_from_corners(RUN, none, placed) is placed
 
 
-def test_links_hold_together_what_no_track_crosses(tmp_path: Path) -> None:
+def test_links_join_images_across_a_gap_in_the_tracks(tmp_path: Path) -> None:
     placed, seen = scene()
     joint = 4  # the image before it
     after = placed.frames > joint
-    # All after the joint is 6 px up there, more than motion may be off.
+    # All images after the joint are shifted by about 6 px, more than the error of motion tracks.
     off = np.column_stack([np.eye(3), [0, 0.07, 0]])
     images = [
         replace(i, cam_from_world=np.column_stack([i.cam_from_world[:, :3], moved]))

@@ -1,4 +1,4 @@
-"""What moves by itself, in tracks of a made-up scene and in a clip."""
+"""Detection of dynamic objects, in synthetic tracks and in a clip."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Made:
 
 
 def cameras(rng: np.random.Generator) -> list[PosedCamera]:
-    """A camera that goes to the right, with an unsteady hand."""
+    """A hand-held camera that moves to the right."""
     step = np.arange(NUM_IMAGES)
     centres = np.column_stack([0.08 * step, 0.05 * np.sin(step / 2), 0.03 * np.cos(step / 3)])
     poses = []
@@ -116,7 +116,7 @@ def made(velocity: tuple[float, float, float] | None, *, drift: float = 0.0) -> 
     for point, seen in enumerate(found):
         # A track ends where its point is hidden.
         breaks = np.diff([s[0] for s in seen]) > 1
-        # Encoders' tracks break off at other places, too.
+        # Tracks of encoders also break at random.
         breaks |= rng.random(len(breaks)) < 0.07
         for piece in np.split(seen, np.flatnonzero(breaks) + 1):
             if len(piece) >= 4:
@@ -144,14 +144,14 @@ def made(velocity: tuple[float, float, float] | None, *, drift: float = 0.0) -> 
     return Made(placed, views, np.array(moves))
 
 
-def test_points_lie_in_cells_of_very_wide_pictures() -> None:
+def test_points_fall_into_the_right_cells_of_very_wide_images() -> None:
     width, cell, columns = 40_000, 16, [1, 1000, 2047, 2048, 2499]
     camera = pycolmap.Camera(model="PINHOLE", width=width, height=64, params=[100, 100, 0, 32])
     views = [PosedCamera(camera, np.eye(4)[:3]) for _ in range(2)]
     one, first = np.ones(5), np.zeros(5, np.int64)
     x = (np.array(columns) + 0.5) * cell
     xyz = np.column_stack([x / 100, 0 * one, one])
-    # The first image sees each of them all the time, the other one shows where they should be.
+    # The first image observes every point; the second one should observe them and does not.
     length = 6
     track = np.repeat(np.arange(5), length)
     column = (x // cell).astype(np.int64)[track]
@@ -164,12 +164,12 @@ def test_points_lie_in_cells_of_very_wide_pictures() -> None:
     assert np.argwhere(unseen[1]).tolist() == [[2, k] for k in columns]
 
 
-# Along the epipolar lines against the camera and faster than it, towards it, and upwards.
+# Along the epipolar lines (against the camera, and faster than it), towards the camera, upwards.
 WALKS = [(-0.05, 0, 0), (0.13, 0, 0), (-0.01, 0, -0.06), (0, -0.03, 0)]
 
 
 @pytest.mark.parametrize("velocity", WALKS)
-def test_a_walker_is_found_whatever_the_direction(velocity: tuple[float, float, float]) -> None:
+def test_walker_is_found_in_any_direction(velocity: tuple[float, float, float]) -> None:
     scene = made(velocity)
     found = Contradictions(scene.placed, scene.views)
     by_depth = found.by_depth(np.zeros(len(scene.moves), np.bool_))
@@ -179,43 +179,43 @@ def test_a_walker_is_found_whatever_the_direction(velocity: tuple[float, float, 
     placed = scene.placed
     within = placed.mean(cells[placed.image, placed.row, placed.column])
     assert np.mean(within[scene.moves] > 0.5) > 0.9
-    # Grown by a cell, so what is beside is touched.
+    # Dynamic regions are dilated by a cell, so some static tracks next to them are included.
     assert np.mean(within[~scene.moves] > 0.5) < 0.12
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.3])
-def test_nothing_moves_in_a_still_scene(drift: float) -> None:
-    """A box before a wall hides and shows it; encoders let tracks of smooth surfaces drift."""
+def test_static_scene_has_no_dynamic_cells(drift: float) -> None:
+    """Occlusion by the box and drifting tracks on smooth surfaces do not count as motion."""
     scene = made(None, drift=drift)
     assert not dynamic_cells(scene.placed, scene.views).any()
 
 
-def test_what_is_known_to_move_is_not_the_usual() -> None:
-    """Of a scene most of which moves, the rest says by itself what it usually says."""
+def test_usual_share_is_computed_from_static_cells() -> None:
+    """Where most of the scene moves, only the static rest gives the baseline."""
     placed = made(None).placed
     _, _, columns = placed.shape
     moving = np.zeros(placed.shape, np.bool_)
     moving[:, :, : 2 * columns // 3] = True
     within = placed.mean(moving[placed.image, placed.row, placed.column])
-    says = np.where(within > 0.5, 1.0, 0.3)
+    share_of_track = np.where(within > 0.5, 1.0, 0.3)
     inside = (slice(None), slice(4, -4), slice(2 * columns // 3 + 6, -4))
     for still, expected in ((~moving, 0.0), (np.ones_like(moving), -0.7)):
-        share = shares_above_usual(placed, says, still)[inside]
+        share = shares_above_usual(placed, share_of_track, still)[inside]
         assert np.median(share) == pytest.approx(expected, abs=0.05)
 
 
-def test_patches_that_only_time_joins_to_what_moves_are_left_out() -> None:
+def test_weak_patches_are_dropped_from_the_dynamic_regions() -> None:
     cells, share = np.zeros((2, 20, 30), np.bool_), np.full((2, 20, 30), 0.1)
     cells[:, 2:10, 3:9] = True
     share[:, 4:9, 4:8] = 0.7
-    cells[0, 12:16, 20:26] = True  # at the edge of what somebody passed
+    cells[0, 12:16, 20:26] = True  # at the edge of a region that a person passed
     share[0, 12, 20] = 0.7
     found = strong_patches(cells, share)
     assert found[:, 2:10, 3:9].all()
     assert found.sum() == 2 * 8 * 6
 
 
-def test_points_of_few_images_count_where_one_shows_nothing_that_moves() -> None:
+def test_points_of_few_images_are_static_if_one_image_shows_no_motion() -> None:
     images = [[0, 1, 2], [2, 3, 4, 5], [3, 4, 5, 6, 7], [4, 5, 6, 8], [9, 10, 11]]
     count = len(images)
     points = ModelPoints(
@@ -230,7 +230,7 @@ def test_points_of_few_images_count_where_one_shows_nothing_that_moves() -> None
     assert len(static_points(no_points(), shows_moving)) == 0
 
 
-# A poster of so many pixels that goes across the pictures of the rendered courtyard.
+# Width and height in pixels of a poster that moves across the frames of the rendered courtyard.
 POSTER = (88, 200)
 NUM_FRAMES = 30
 
@@ -239,7 +239,7 @@ NUM_FRAMES = 30
 def walked(
     encode: Encode, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, NDArray[np.bool_]]:
-    """A clip with a textured thing that moves against the picture, and where that is."""
+    """A clip with a poster that moves across the scene, and the pixels of the poster."""
     scene = Path(__file__).resolve().parents[2] / "examples" / "scene.mp4"
     shown = (picture for _, picture in decode_frames(scene))
     frames = np.array(list(itertools.islice(shown, NUM_FRAMES)))
@@ -254,7 +254,7 @@ def walked(
     return encode(frames, tmp_path_factory.mktemp("walked") / "walked.mp4"), there
 
 
-def test_reconstruct_leaves_out_what_moves(
+def test_reconstruct_masks_dynamic_pixels(
     walked: tuple[Path, NDArray[np.bool_]], truth: Truth, tmp_path: Path
 ) -> None:
     video, there = walked
@@ -287,14 +287,14 @@ def test_reconstruct_leaves_out_what_moves(
 
 @dataclass(frozen=True)
 class Passed:
-    """The scene with a broad band that goes across its pictures and cuts the tracks it hides.
+    """The scene with a broad band that moves across the images and cuts the tracks behind it.
 
     Attributes:
-        run: what the stages before leave.
-        moving: masks that leave out the band, by the images' names.
-        tracks: tracks of the scene, ended and begun anew at the band.
-        placed: its images.
-        left: the first column of the band in each.
+        run: the run after the preceding stages.
+        moving: masks of the band, by image name.
+        tracks: tracks of the scene, cut at the band.
+        placed: the posed images.
+        left: the first column of the band in each image.
     """
 
     run: Run
@@ -347,8 +347,8 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
 
 
 def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """The observations before gaps of five and more frames, and pixels by which tracks are off
-    behind some of them."""
+    """The observations before gaps of five frames or more, and the errors in pixels after every
+    third gap."""
     before = np.flatnonzero((np.diff(tracks.frame) > 5) & (np.diff(tracks.track) == 0))
     scene = render_scene.build_scene()
     off = []
@@ -360,7 +360,7 @@ def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     return before, np.array(off)
 
 
-def test_tracks_are_followed_behind_what_passes(passed: Passed) -> None:
+def test_tracks_continue_behind_a_passing_object(passed: Passed) -> None:
     found = follow_behind(passed.run, passed.moving, passed.tracks, passed.placed)
     assert found.num_observations > 1.1 * passed.tracks.num_observations
     assert len(off_behind(passed.tracks)[0]) < 10
@@ -374,8 +374,8 @@ def test_tracks_are_followed_behind_what_passes(passed: Passed) -> None:
 
 
 @pytest.mark.parametrize("pixels", [1, 7])
-def test_poses_that_are_off_lead_no_track_astray(passed: Passed, pixels: float) -> None:
-    """What lies where a track is expected in vain is not followed from there on."""
+def test_wrong_poses_do_not_continue_tracks_wrongly(passed: Passed, pixels: float) -> None:
+    """Where the predicted position is wrong, another feature there is not followed instead."""
     turn = Rotation.from_euler("y", pixels / 520).as_matrix()
     images = [
         replace(image, cam_from_world=turn @ image.cam_from_world) if frame >= 20 else image
@@ -385,7 +385,7 @@ def test_poses_that_are_off_lead_no_track_astray(passed: Passed, pixels: float) 
     found = follow_behind(passed.run, passed.moving, early, replace(passed.placed, images=images))
     first = np.repeat(found.offsets[:-1], found.lengths)
     late = np.flatnonzero(found.frame >= 20)
-    if pixels > 1:  # beyond what is searched
+    if pixels > 1:  # outside the search window
         assert len(late) < 10
         return
     assert len(late) > 100
@@ -398,12 +398,12 @@ def test_poses_that_are_off_lead_no_track_astray(passed: Passed, pixels: float) 
     assert np.median(off) < 0.4
 
 
-def test_points_are_looked_for_where_they_should_be_seen() -> None:
+def test_points_are_expected_in_the_images_they_project_to() -> None:
     rng = np.random.default_rng(3)
     views = cameras(rng)
     x, y = np.meshgrid(np.arange(-3.0, 5.0, 0.5), np.arange(-2.0, 2.5, 0.5))
     xyz = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, WALL)])
-    # Of each the first three images that show it, and three after a gap.
+    # Each point is observed in the first three images that show it and in three after a gap.
     rows = []
     shown = [dict(zip(*view.project(xyz)[:2], strict=True)) for view in views]
     for point in range(len(xyz)):
@@ -428,8 +428,8 @@ def test_points_are_looked_for_where_they_should_be_seen() -> None:
     left_half[:, : WIDTH // 2] = False
     views = [replace(view, mask=make_mask(left_half)) for view in views]
     found, expected = expect_in_views(tracks, image[kept], points, views, frames)
-    # What was seen stays, and each point is expected where it is in other images, later ones only,
-    # off the edge and where the mask does not leave it out.
+    # Observations are kept, and each point is expected at its projection in later images, except
+    # near the edge and on masks.
     np.testing.assert_array_equal(found.xy[~expected], tracks.xy)
     np.testing.assert_array_equal(found.frame[~expected], tracks.frame)
     assert expected.sum() > 300

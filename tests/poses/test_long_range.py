@@ -1,4 +1,4 @@
-"""Views from far apart in time held against poses, of models that hold together and that do not."""
+"""The long-range check compares images far apart in time with the poses of a model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FAILED_CHECK = 1
 
 @pytest.fixture(scope="module")
 def bent(made: ReconstructReport, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The model with the later half of its images turned by five degrees about the camera."""
+    """The model with the second half of its images rotated by five degrees."""
     model = read_model(made.output / "sparse" / "0")
     half = len(model.images) // 2
     turn = pycolmap.Rigid3d(
@@ -35,7 +35,7 @@ def bent(made: ReconstructReport, tmp_path_factory: pytest.TempPathFactory) -> P
     return folder
 
 
-def test_model_that_holds_together(made: ReconstructReport) -> None:
+def test_consistent_model_passes(made: ReconstructReport) -> None:
     model = read_model(made.output / "sparse" / "0")
     found = model_long_range_errors(model, made.output / "images")
     assert found.median == pytest.approx(made.far_views, rel=0.05)
@@ -44,7 +44,7 @@ def test_model_that_holds_together(made: ReconstructReport) -> None:
     assert found.warning() is None
 
 
-def test_bent_model_is_told(
+def test_bent_model_is_reported(
     made: ReconstructReport, bent: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     images = made.output / "images"
@@ -61,7 +61,7 @@ def test_bent_model_is_told(
     assert main([*whole, "--image_path", str(images)]) == 0
 
 
-def test_pictures_that_show_nothing_are_told(made: ReconstructReport, tmp_path: Path) -> None:
+def test_images_without_texture_are_reported(made: ReconstructReport, tmp_path: Path) -> None:
     for path in (made.output / "images").iterdir():
         blurred = cv2.blur(cv2.imread(str(path)), (61, 61))
         cv2.imwrite(str(tmp_path / path.name), blurred)
@@ -80,15 +80,15 @@ def test_images_of_another_size_are_refused(made: ReconstructReport, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "missing"),
     [
         ([], "--database"),
         (["--model", "m"], "--image_path"),
         (["--database", "d.db", "--image_path", "i"], "--model"),
     ],
 )
-def test_half_a_question_is_refused(
-    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+def test_check_names_the_missing_option(
+    words: list[str], missing: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["check", *words]) == 2
-    assert said in capsys.readouterr().err
+    assert missing in capsys.readouterr().err

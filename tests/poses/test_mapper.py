@@ -33,7 +33,7 @@ def run_mapper(folder: Path, database: Path, mapper: Mapper, progress: Progress)
     )
 
 
-def test_interrupted_mapper_ends(made: ReconstructReport, tmp_path: Path) -> None:
+def test_interrupted_mapper_writes_no_model(made: ReconstructReport, tmp_path: Path) -> None:
     def interrupt(stage: str, done: int, total: int | None) -> None:
         if done >= 2:
             raise KeyboardInterrupt
@@ -45,7 +45,7 @@ def test_interrupted_mapper_ends(made: ReconstructReport, tmp_path: Path) -> Non
     assert not list((tmp_path / "poses").rglob("*.bin"))
 
 
-def test_mapper_that_fails(tmp_path: Path) -> None:
+def test_failing_mapper_names_its_log(tmp_path: Path) -> None:
     (tmp_path / "no.db").write_bytes(b"no database")
     with pytest.raises(ModelError, match="log"):
         run_mapper(tmp_path, tmp_path / "no.db", "global", no_progress)
@@ -55,7 +55,7 @@ def test_mapper_that_fails(tmp_path: Path) -> None:
 def test_mapper_starts_from_the_longest_tracks(
     made: ReconstructReport, truth: Truth, tmp_path: Path
 ) -> None:
-    """And finds the points of the others, too."""
+    """Shorter tracks are left out of the first mapping, but their points are added later."""
     found = {}
     for start_tracks in (None, 40):
         folder = tmp_path / str(start_tracks)
@@ -90,14 +90,14 @@ def log_of(folder: Path) -> str:
 
 
 def adjusted_model(made: ReconstructReport, folder: Path) -> pycolmap.Reconstruction:
-    """The model that the adjustment left, with its points, as COLMAP's files in a folder."""
+    """The adjusted model with its points, written to a folder as a COLMAP model."""
     adjusted = read_posed_model(made.output / ".stages" / "adjusted.npz")
     write_model(folder, adjusted.cameras, adjusted.images, adjusted.points)
     return read_model(folder)
 
 
 @pytest.mark.parametrize("iterative", [False, True])
-def test_adjustment_mends_poses(
+def test_adjustment_corrects_perturbed_poses(
     made: ReconstructReport, truth: Truth, tmp_path: Path, iterative: bool
 ) -> None:
     model = adjusted_model(made, tmp_path)
@@ -128,10 +128,10 @@ def test_adjustment_mends_poses(
     assert adjusted.cameras[1].mean_focal_length() == focal_length
 
 
-def test_the_end_of_a_video_bends_back(
+def test_adjustment_straightens_a_bent_end(
     made: ReconstructReport, truth: Truth, tmp_path: Path
 ) -> None:
-    """The last images are off together with what they see: only points at the joint tell."""
+    """The last images are wrong together with their points: only points at the joint show it."""
     model = adjusted_model(made, tmp_path)
     for number, point in list(model.points3D.items()):
         if point.track.length() > 6:
@@ -163,10 +163,10 @@ def test_the_end_of_a_video_bends_back(
     assert errors[0.25,] > 10 * errors[1.0, 0.25]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="files have no limits there")
+@pytest.mark.skipif(sys.platform == "win32", reason="file sizes cannot be limited there")
 def test_full_disk(made: ReconstructReport, tmp_path: Path) -> None:
-    """COLMAP says nothing of what it cannot write."""
-    import resource  # noqa: PLC0415 - there is none on Windows
+    """COLMAP reports no error when it cannot write a model."""
+    import resource  # noqa: PLC0415 - not available on Windows
 
     (tmp_path / "model").mkdir()
     adjusted_model(made, tmp_path / "model")
@@ -187,10 +187,10 @@ def test_full_disk(made: ReconstructReport, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("kept", "stays"), [(8, False), (29, False), (30, True)])
-def test_images_that_see_hardly_any_point_are_left_out(
+def test_images_with_few_points_are_dropped(
     made: ReconstructReport, tmp_path: Path, kept: int, stays: bool
 ) -> None:
-    """Nothing but a few points tells their pose, as where something near fills the picture."""
+    """A few points determine a pose badly, for example where a near object fills the image."""
     model = adjusted_model(made, tmp_path)
     assert model.num_reg_images() == NUM_IMAGES
     image = min(model.images.values(), key=lambda image: image.name)
@@ -203,7 +203,9 @@ def test_images_that_see_hardly_any_point_are_left_out(
     assert set(posed_images(found)) == set(posed_images(read_model(tmp_path))) == names
 
 
-def test_images_of_a_model_of_few_points_stay(made: ReconstructReport, tmp_path: Path) -> None:
+def test_images_of_a_model_with_few_points_are_kept(
+    made: ReconstructReport, tmp_path: Path
+) -> None:
     model = adjusted_model(made, tmp_path)
     by_length = sorted(model.points3D, key=lambda number: -model.points3D[number].track.length())
     for number in by_length[25:]:

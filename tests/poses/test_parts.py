@@ -1,4 +1,4 @@
-"""Splitting of models at seams that hardly any point joins."""
+"""Models are split at seams that hardly any point joins."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def images(*counts: int) -> ImageSet:
 
 
 def model(image_set: ImageSet, views: list[list[int]]) -> PosedModel:
-    """All images, and a point for each list of images that see it."""
+    """A model of all images, with a point for each list of images that see it."""
     count = len(views)
     points = ModelPoints(
         xyz=np.zeros((count, 3)),
@@ -50,7 +50,7 @@ def seam(image_set: ImageSet, before: int) -> tuple[str, str]:
     return image_set.images.names[before], image_set.images.names[before + 1]
 
 
-def test_a_seam_that_few_points_join() -> None:
+def test_model_is_split_at_a_seam_with_few_points() -> None:
     image_set = images(30)
     known = model(image_set, [[12, 13]] * 50)
     first, second = parts_of(known, image_set, [seam(image_set, 12)])
@@ -59,7 +59,7 @@ def test_a_seam_that_few_points_join() -> None:
     assert len(parts_of(known, image_set, [seam(image_set, 12)])) == 1
 
 
-def test_points_seen_in_a_turn_do_not_hold() -> None:
+def test_points_seen_during_a_turn_do_not_join_parts() -> None:
     image_set = images(30)
     known = model(image_set, [[12, 13]] * 1000)
     assert len(parts_of(known, image_set, [], [seam(image_set, 12)])) == 2
@@ -67,7 +67,7 @@ def test_points_seen_in_a_turn_do_not_hold() -> None:
     assert len(parts_of(known, image_set, [], [seam(image_set, 12)])) == 1
 
 
-def test_a_place_seen_again_holds() -> None:
+def test_a_revisited_place_joins_parts() -> None:
     image_set = images(36)
     seams = [seam(image_set, 11), seam(image_set, 23)]
     assert len(parts_of(model(image_set, [[0, 35]] * 50), image_set, seams)) == 3
@@ -76,7 +76,7 @@ def test_a_place_seen_again_holds() -> None:
     assert second == names(image_set, *range(12, 24))
 
 
-def test_another_video_holds() -> None:
+def test_another_video_joins_parts() -> None:
     image_set = images(24, 12)
     seams = [seam(image_set, 11)]
     apart = [[0, 1, 24]] * 100
@@ -84,7 +84,7 @@ def test_another_video_holds() -> None:
     assert len(parts_of(model(image_set, [*apart, *[[23, 30]] * 30]), image_set, seams)) == 1
 
 
-def test_short_parts_are_left_out() -> None:
+def test_short_parts_are_dropped() -> None:
     image_set = images(30)
     seams = [seam(image_set, 13), seam(image_set, 15)]
     parts = parts_of(model(image_set, [[0, 1]]), image_set, seams)
@@ -95,8 +95,8 @@ def test_short_parts_are_left_out() -> None:
 
 
 @pytest.mark.slow
-def test_a_walk_through_rooms_with_fast_turns(tmp_path: Path) -> None:
-    """No model is bent, and most images are in one, whatever the turns leave."""
+def test_walk_with_fast_turns_gives_no_bent_model(tmp_path: Path) -> None:
+    """No model is bent, and most images are registered, wherever the turns split the walk."""
     num_frames = 75  # two of the four turns
     walks.make_clip(tmp_path / "walk.mp4", seed=0, num_frames=num_frames)
     truth = walks.walk(0)[:num_frames]

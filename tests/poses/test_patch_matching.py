@@ -1,4 +1,4 @@
-"""Corners are found again where a textured plane shows them, wherever its images were taken."""
+"""Corners of a textured plane are matched by patches in images from other viewpoints."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from colmap_av1.poses.corners.patch_matching import match_patches
 from colmap_av1.tracks.tracks import Tracks
 
 FOCAL, WIDTH, HEIGHT = 300.0, 320, 240
-NUM_FOLLOWED = 3  # images that corners were followed through, the first ones
+NUM_FOLLOWED = 3  # the first images, through which corners were tracked
 NUM_CORNERS = 120
-# The plane is 3 away; a pixel of its texture is so wide.
+# Width of a texture pixel; the plane is at distance 3.
 TEXEL = 0.01
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A textured plane: its images, and corners of it that were followed through the first."""
+    """Images of a textured plane, and corners tracked through the first images."""
 
     views: list[PosedCamera]
     pictures: list[NDArray[np.uint8]]
@@ -46,7 +46,7 @@ class Scene:
 
 
 def pose(shift: tuple[float, float, float], turn: tuple[float, float, float]) -> Any:
-    """A camera at a place of the plane's world, turned by degrees about its axes."""
+    """A camera at a position, rotated by angles in degrees about its axes."""
     rotation = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
     return np.column_stack([rotation, -rotation @ np.array(shift)])
 
@@ -55,7 +55,7 @@ POSES = (
     pose((-0.15, 0, 0), (0, 0, 0)),
     pose((0, 0, 0), (0, 0, 0)),
     pose((0.15, 0, 0), (0, 1, 0)),
-    # From elsewhere, nearer, and turned about its axis.
+    # Other viewpoints: nearer, and rolled.
     pose((0.7, 0.1, 0.3), (0, 12, 20)),
     pose((-0.4, -0.2, -0.5), (-3, -8, -10)),
 )
@@ -67,7 +67,7 @@ def _scene() -> Scene:
 
 
 def make_scene(tilt: float) -> Scene:
-    """The scene, its plane so much farther away by a unit to the right."""
+    """The scene; the depth of the plane grows by `tilt` per unit to the right."""
     rng = np.random.default_rng(4)
     texture = cv2.GaussianBlur(rng.integers(0, 256, (700, 900)).astype(np.float32), (0, 0), 2.0)
     texture = cv2.normalize(texture, texture, 20, 235, cv2.NORM_MINMAX)
@@ -77,7 +77,7 @@ def make_scene(tilt: float) -> Scene:
     views = [PosedCamera(camera, own) for own in POSES]
     pictures = []
     for own in POSES:
-        # From the texture's pixels, the first one's centre at (0, 0), to those of the picture.
+        # From texture pixels, with the centre of the first at (0, 0), to image pixels.
         to_plane = np.array(
             [[TEXEL, 0, -4.5], [0, TEXEL, -3.5], [TEXEL * tilt, 0, 3.0 - 4.5 * tilt]]
         )
@@ -104,7 +104,7 @@ def make_scene(tilt: float) -> Scene:
     )
     made = Scene(views, pictures, corners, corners.frame.astype(np.int64), points)
     followed = np.stack([made.places(image) for image in range(NUM_FOLLOWED)], axis=1)
-    # They drift, but not in the image in the middle, which shows what is looked for.
+    # The tracks drift, except in the middle image, which gives the template.
     drift = rng.uniform(-1, 1, followed.shape) * np.array([1, 0, 1])[:, None]
     xy = (followed + drift).reshape(-1, 2).astype(np.float32)
     return replace(made, corners=replace(corners, xy=xy))
@@ -119,7 +119,7 @@ def _kept(scene: Scene, tmp_path: Path) -> Iterator[GreyPictures]:
 
 
 def look(scene: Scene, pictures: GreyPictures, views: list[PosedCamera] | None = None) -> Tracks:
-    """What is found again in the scene."""
+    """Match the corners of the scene."""
     seen: list[int] = []
     found = match_patches(
         *(scene.corners, scene.view, scene.points),
@@ -133,14 +133,12 @@ def look(scene: Scene, pictures: GreyPictures, views: list[PosedCamera] | None =
 
 
 def errors(scene: Scene, found: Tracks, image: int) -> NDArray[np.float64]:
-    """Distances in pixels of what an image shows from the nearest true places."""
+    """Distances in pixels from the observations in an image to the nearest true positions."""
     at = found.xy[found.frame == image].astype(np.float64)
     return np.asarray(np.linalg.norm(at[:, None] - scene.places(image), axis=2).min(axis=1))
 
 
-def test_corners_are_where_other_views_show_them_without_drift(
-    scene: Scene, kept: GreyPictures
-) -> None:
+def test_matched_corners_do_not_drift(scene: Scene, kept: GreyPictures) -> None:
     found = look(scene, kept)
     for image in range(len(POSES)):
         off = errors(scene, found, image)
@@ -151,7 +149,7 @@ def test_corners_are_where_other_views_show_them_without_drift(
     assert (np.diff(found.frame)[np.diff(found.track) == 0] > 0).all()
 
 
-def test_slanted_surfaces_are_looked_for_as_they_are_seen(tmp_path: Path) -> None:
+def test_slanted_surfaces_are_matched_with_warped_patches(tmp_path: Path) -> None:
     slanted = make_scene(tilt=1.0)
     with GreyPictures(tmp_path) as pictures:
         for image, picture in enumerate(slanted.pictures):
@@ -159,13 +157,13 @@ def test_slanted_surfaces_are_looked_for_as_they_are_seen(tmp_path: Path) -> Non
         found = look(slanted, pictures)
     for image in (3, 4):
         off = errors(slanted, found, image)
-        # Looked for as if it faced the camera they would be 0.30 and 0.16 px off.
+        # Without the slope of the surface the median errors would be 0.30 and 0.16 px.
         assert len(off) > 80
         assert np.median(off) < 0.05
         assert np.quantile(off, 0.9) < 0.1
 
 
-def test_poses_that_are_off_by_pixels_are_right_enough(scene: Scene, kept: GreyPictures) -> None:
+def test_pose_errors_of_two_pixels_do_not_matter(scene: Scene, kept: GreyPictures) -> None:
     turn = Rotation.from_euler("y", 0.4, degrees=True).as_matrix()  # 2 pixels
     views = [
         *scene.views[:3],
@@ -176,7 +174,7 @@ def test_poses_that_are_off_by_pixels_are_right_enough(scene: Scene, kept: GreyP
     assert np.median(off) < 0.05
 
 
-def test_what_a_mask_leaves_out_is_not_found(scene: Scene, kept: GreyPictures) -> None:
+def test_corners_on_masks_are_not_matched(scene: Scene, kept: GreyPictures) -> None:
     counts = np.ones((HEIGHT, WIDTH), np.bool_)
     counts[:, : WIDTH // 2] = False
     views = [*scene.views[:4], replace(scene.views[4], mask=make_mask(counts))]
@@ -185,7 +183,7 @@ def test_what_a_mask_leaves_out_is_not_found(scene: Scene, kept: GreyPictures) -
     assert (found.frame == 4).any()
 
 
-def test_a_picture_of_something_else_shows_none(scene: Scene, tmp_path: Path) -> None:
+def test_unrelated_image_has_no_matches(scene: Scene, tmp_path: Path) -> None:
     other = np.random.default_rng(8).integers(0, 256, (HEIGHT, WIDTH)).astype(np.float32)
     with GreyPictures(tmp_path) as pictures:
         for image, picture in enumerate(scene.pictures[:4]):
@@ -195,7 +193,7 @@ def test_a_picture_of_something_else_shows_none(scene: Scene, tmp_path: Path) ->
     assert np.count_nonzero(found.frame == 4) < 3
 
 
-def test_where_few_are_found_those_followed_stay(scene: Scene, tmp_path: Path) -> None:
+def test_tracked_positions_are_kept_where_few_patches_match(scene: Scene, tmp_path: Path) -> None:
     with GreyPictures(tmp_path) as pictures:
         for image, picture in enumerate(scene.pictures):
             blank = np.full_like(picture, 128)
@@ -207,7 +205,7 @@ def test_where_few_are_found_those_followed_stay(scene: Scene, tmp_path: Path) -
     assert {tuple(xy) for xy in kept.tolist()} <= {tuple(xy) for xy in followed.tolist()}
 
 
-def test_images_without_pictures_show_none(scene: Scene, tmp_path: Path) -> None:
+def test_images_without_pictures_have_no_matches(scene: Scene, tmp_path: Path) -> None:
     with GreyPictures(tmp_path) as pictures:
         for image, picture in enumerate(scene.pictures[:4]):
             pictures.keep(image, picture)
@@ -215,7 +213,7 @@ def test_images_without_pictures_show_none(scene: Scene, tmp_path: Path) -> None
     assert set(found.frame.tolist()) == {0, 1, 2, 3}
 
 
-def test_smaller_pictures_give_pixels_of_the_images(scene: Scene, tmp_path: Path) -> None:
+def test_smaller_pictures_give_full_size_coordinates(scene: Scene, tmp_path: Path) -> None:
     size = (WIDTH // 2, HEIGHT // 2)
     with GreyPictures(tmp_path) as pictures:
         for image, picture in enumerate(scene.pictures):
@@ -228,7 +226,7 @@ def test_smaller_pictures_give_pixels_of_the_images(scene: Scene, tmp_path: Path
     assert np.median(off) < 0.1
 
 
-def test_no_corners_are_no_tracks(scene: Scene, kept: GreyPictures) -> None:
+def test_no_corners_give_no_tracks(scene: Scene, kept: GreyPictures) -> None:
     none = np.empty(0, np.int64)
     nothing = replace(
         scene,

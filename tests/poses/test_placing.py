@@ -1,4 +1,4 @@
-"""Where a model is placed, by positions, gravity, vertical lines and known distances."""
+"""Models are placed by positions, gravity, vertical lines and known distances."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def looking(centres: NDArray[np.float64], forward: NDArray[np.float64]) -> NDArr
 
 
 def walk(num: int = 40, *, straight: bool = False) -> NDArray[np.float64]:
-    """Poses of a walk of 20 m, pitched down by 20 degrees, in metres with z up."""
+    """Poses of a walk of 20 m with a camera pitched down by 20 degrees, in metres with z up."""
     t = np.linspace(0, 1, num)
     side = np.zeros(num) if straight else 3 * np.sin(4 * t)
     centres = np.column_stack([20 * t, side, 0.05 * np.sin(9 * t) + 1.6])
@@ -60,7 +60,7 @@ def walk(num: int = 40, *, straight: bool = False) -> NDArray[np.float64]:
 
 
 def elsewhere(seed: int = 3) -> Similarity:
-    """From metres to a mapper's coordinates."""
+    """A similarity from metres to the coordinates of a mapper."""
     rotation = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     return Similarity(0.07, rotation, np.array([1.0, -2.0, 0.5]))
 
@@ -73,7 +73,7 @@ def angle(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(np.rad2deg(np.arccos(np.clip(a @ b, -1, 1))))
 
 
-def test_similarity_moves_poses_as_it_moves_points() -> None:
+def test_similarity_transforms_poses_like_points() -> None:
     moved = elsewhere()
     poses = walk()
     np.testing.assert_allclose(
@@ -86,7 +86,7 @@ def test_similarity_moves_poses_as_it_moves_points() -> None:
     np.testing.assert_allclose(seen, moved.scale * before, atol=1e-12)
 
 
-def test_plane_that_touches_the_ellipsoid() -> None:
+def test_east_north_up_is_tangent_to_the_ellipsoid() -> None:
     origin = (59.33, 18.07, 20.0)
     # A minute of latitude is a sea mile, one of longitude half as long there.
     there = np.array([[59.33 + 1 / 60, 18.07, 20], [59.33, 18.07 + 1 / 60, 21]])
@@ -97,15 +97,15 @@ def test_plane_that_touches_the_ellipsoid() -> None:
 
 
 @pytest.mark.parametrize("straight", [False, True])
-def test_path_is_brought_onto_positions_with_noise_and_jumps(straight: bool) -> None:
+def test_path_is_fitted_to_positions_with_noise_and_outliers(straight: bool) -> None:
     poses = walk(straight=straight)
     positions = camera_centres(poses)
     rng = np.random.default_rng(1)
-    said = positions + rng.normal(0, 0.4, positions.shape)
-    said[[5, 20, 21]] += [[80.0, 0, 0], [0, -500, 30], [0, 0, 15]]
+    measured = positions + rng.normal(0, 0.4, positions.shape)
+    measured[[5, 20, 21]] += [[80.0, 0, 0], [0, -500, 30], [0, 0, 15]]
     mapped = elsewhere().apply_to_poses(poses)
     up = Up(up_of_cameras(mapped), np.deg2rad(6))
-    found = fit_path(camera_centres(mapped), said, up, 0)
+    found = fit_path(camera_centres(mapped), measured, up, 0)
     assert isinstance(found, PathFit)
     assert found.num_used == 37
     placed = found.similarity.apply(camera_centres(mapped))
@@ -113,48 +113,48 @@ def test_path_is_brought_onto_positions_with_noise_and_jumps(straight: bool) -> 
     assert found.similarity.scale * elsewhere().scale == pytest.approx(1, abs=0.03)
     level = found.similarity.rotation @ elsewhere().rotation @ Z
     assert angle(level, Z) < 4
-    again = fit_path(camera_centres(mapped), said, up, 0)
+    again = fit_path(camera_centres(mapped), measured, up, 0)
     assert isinstance(again, PathFit)
     assert np.array_equal(again.similarity.rotation, found.similarity.rotation)
 
 
 @pytest.mark.parametrize("straight", [False, True])
-def test_a_third_of_the_positions_may_jump(straight: bool) -> None:
+def test_a_third_of_the_positions_may_be_outliers(straight: bool) -> None:
     poses = walk(straight=straight)
     positions = camera_centres(poses)
     rng = np.random.default_rng(1)
-    said = positions + rng.normal(0, 0.4, positions.shape)
-    jumped = rng.permutation(len(said))[: len(said) // 3]
-    said[jumped] += rng.normal(0, 800, (len(jumped), 3))
+    measured = positions + rng.normal(0, 0.4, positions.shape)
+    jumped = rng.permutation(len(measured))[: len(measured) // 3]
+    measured[jumped] += rng.normal(0, 800, (len(jumped), 3))
     mapped = elsewhere().apply_to_poses(poses)
     up = Up(up_of_cameras(mapped), np.deg2rad(6))
-    found = fit_path(camera_centres(mapped), said, up, 0)
+    found = fit_path(camera_centres(mapped), measured, up, 0)
     assert isinstance(found, PathFit), found
-    assert found.num_used == len(said) - len(jumped)
+    assert found.num_used == len(measured) - len(jumped)
     placed = found.similarity.apply(camera_centres(mapped))
     assert np.abs(placed - positions).max() < 0.6
 
 
 @pytest.mark.parametrize(
-    ("said", "why"),
+    ("move", "reason"),
     [
         (lambda p, rng: np.tile(p[0], (len(p), 1)), "still"),
         (lambda p, rng: rng.normal(0, 90, p.shape), "from the path"),
         (lambda p, rng: 0.1 * p + rng.normal(0, 1.5, p.shape), "scatter"),
     ],
 )
-def test_positions_that_place_nothing(said: object, why: str) -> None:
+def test_unusable_positions_give_a_reason(move: object, reason: str) -> None:
     poses = walk()
-    places = said(camera_centres(poses), np.random.default_rng(0))  # type: ignore[operator]
+    places = move(camera_centres(poses), np.random.default_rng(0))  # type: ignore[operator]
     found = fit_path(camera_centres(poses), places, Up(Z, 0.1), 0)
     assert isinstance(found, str)
-    assert why in found
+    assert reason in found
 
 
 @given(st.integers(0, 1000))
 @settings(max_examples=25, deadline=None)
-def test_up_by_how_the_camera_was_held(seed: int) -> None:
-    """Pitch does not spoil it as long as the camera turns, and a mapper's world may lie anyhow."""
+def test_up_is_estimated_from_the_camera_orientation(seed: int) -> None:
+    """Pitch does no harm if the camera turns, and the mapper's world may have any orientation."""
     world = elsewhere(seed)
     poses = world.apply_to_poses(walk())
     up = up_of_cameras(poses)
@@ -164,7 +164,7 @@ def test_up_by_how_the_camera_was_held(seed: int) -> None:
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
-def test_up_by_gravity_in_axes_of_any_recorder(order: tuple[int, ...]) -> None:
+def test_up_by_gravity_works_in_any_sensor_axes(order: tuple[int, ...]) -> None:
     world = elsewhere()
     poses = walk()
     rng = np.random.default_rng(0)
@@ -178,8 +178,8 @@ def test_up_by_gravity_in_axes_of_any_recorder(order: tuple[int, ...]) -> None:
     assert up_of_gravity(poses, np.full((40, 3), np.nan)) is None
 
 
-def test_up_by_vertical_lines() -> None:
-    """Posts that a camera sees that is pitched down, and beams across that it sees, too."""
+def test_up_is_estimated_from_vertical_lines() -> None:
+    """A camera that is pitched down sees posts, and slanted beams as outliers."""
     world = elsewhere()
     poses = walk()[::5]
     normals = []
@@ -204,7 +204,7 @@ def test_up_by_vertical_lines() -> None:
     assert up_of_lines([], rough) is None
 
 
-def test_known_distance_of_cameras_and_of_marks() -> None:
+def test_known_distance_between_cameras_or_marks_gives_the_scale() -> None:
     world = elsewhere()
     poses = walk()
     images = {image.name: image for image in images_of(world.apply_to_poses(poses))}
@@ -228,7 +228,7 @@ def test_known_distance_of_cameras_and_of_marks() -> None:
     found = find_placement([*images.values()], {1: CAMERA}, known, options, 0)
     assert found.units == "metres"
     assert found.similarity.scale * world.scale == pytest.approx(1, rel=1e-3)
-    for wrong, why in (
+    for wrong, reason in (
         ("1=0.png,99.png", "no image '99.png'"),
         (f"1={mark(a, 0)}+{mark(b, 10)},1.png", "not mark the same point"),
         (f"1={mark(a, 0)}+0.png:10:10,1.png", "give METRES=A,B"),
@@ -237,11 +237,11 @@ def test_known_distance_of_cameras_and_of_marks() -> None:
         ("1=0.png,0.png", "both ends"),
         ("far=0.png,1.png", "give METRES=A,B"),
     ):
-        with pytest.raises(OptionError, match=why):
+        with pytest.raises(OptionError, match=reason):
             distance(wrong)
 
 
-def test_distance_beats_the_scale_of_positions() -> None:
+def test_known_distance_overrides_the_scale_of_positions() -> None:
     poses = walk()
     world = elsewhere()
     images = images_of(world.apply_to_poses(poses))
@@ -258,6 +258,6 @@ def test_distance_beats_the_scale_of_positions() -> None:
         moved = camera_centres(
             found.similarity.apply_to_poses(np.array([i.cam_from_world for i in images]))
         )
-        # Its middle stays where positions say it is.
+        # The centre of the path still comes from the positions.
         np.testing.assert_allclose(moved.mean(axis=0), 1.1 * centres.mean(axis=0), atol=1e-6)
         assert found.axes == "of the pose priors"

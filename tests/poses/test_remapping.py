@@ -1,4 +1,4 @@
-"""A bent model gives way to a second mapping of its own observations."""
+"""A bent model is mapped again from its own observations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NUM_IMAGES = 30
 
 
 def model(shift: float = 0.0) -> PosedModel:
-    """A camera that moves along x before points, seen in the picture shifted by some pixels."""
+    """A camera that moves along x in front of points, whose observations are shifted in x."""
     rng = np.random.default_rng(0)
     xyz = rng.uniform([-2, -1, 4], [5, 1, 6], (400, 3))
     camera = pycolmap.Camera(
@@ -45,18 +45,18 @@ def model(shift: float = 0.0) -> PosedModel:
     return PosedModel({1: camera}, images, points)
 
 
-def test_errors_are_those_in_the_pictures() -> None:
+def test_reprojection_errors_are_in_pixels() -> None:
     assert np.allclose(reprojection_errors(model()), 0)
     assert np.allclose(reprojection_errors(model(shift=3.0)), 3)
 
 
-def test_points_behind_a_camera_are_infinitely_wrong() -> None:
+def test_points_behind_a_camera_have_infinite_error() -> None:
     own = model()
     own.points.xyz[:, 2] *= -1
     assert np.isinf(reprojection_errors(own)).all()
 
 
-def test_all_images_that_share_points_are_paired() -> None:
+def test_covisible_images_are_paired() -> None:
     frames = np.arange(NUM_IMAGES, dtype=np.int32)
     tracks = tracks_of_points(model().points, frames, NUM_IMAGES, (640, 480))
     keypoints = image_keypoints(tracks, frames.tolist())
@@ -71,7 +71,7 @@ def test_all_images_that_share_points_are_paired() -> None:
     assert {tuple(pair) for pair in pairs.tolist()} == expected
 
 
-def test_a_second_mapping_is_used_unless_it_fits_the_observations_worse() -> None:
+def test_second_mapping_is_used_if_it_fits_at_least_as_well() -> None:
     def result(kept: float, new_cost: float, share: float = 1.0) -> RemappedResult:
         return RemappedResult("", 3, {}, "global", (), share, kept, cost=1.0, new_cost=new_cost)
 
@@ -83,7 +83,7 @@ def test_a_second_mapping_is_used_unless_it_fits_the_observations_worse() -> Non
 
 
 def tracks_of_lengths(length: int, num_frames: int = 60) -> Tracks:
-    """Twenty tracks that begin in each frame and last as long."""
+    """Twenty tracks of this length that begin in each frame."""
     first = np.repeat(np.arange(num_frames), 20)
     frames = [np.arange(f, min(num_frames, f + length)) for f in first.tolist()]
     count = sum(map(len, frames))
@@ -99,7 +99,7 @@ def tracks_of_lengths(length: int, num_frames: int = 60) -> Tracks:
     )
 
 
-def test_frames_are_fast_where_tracks_end_soon() -> None:
+def test_frames_with_short_tracks_are_fast() -> None:
     assert fast_frames(tracks_of_lengths(6)).all()
     assert not fast_frames(tracks_of_lengths(40)).any()
 
@@ -109,12 +109,12 @@ def test_frames_after_the_last_image_are_not_fast() -> None:
     assert not fast_frames(tracks_of_lengths(40).keep_frames(images)).any()
 
 
-def test_a_drive_whose_tracks_end_evenly_is_not_fast() -> None:
-    """As on a road at ten frames a second, where a fifth of the tracks lasts."""
+def test_drive_with_evenly_short_tracks_is_not_fast() -> None:
+    """On a road at ten frames per second, about a fifth of the tracks are long."""
     short, long = tracks_of_lengths(6, 160), tracks_of_lengths(40, 160)
     middle = np.arange(50, 110, dtype=np.int32)
     drive = Tracks.concatenate(long, *[short] * 20).subsample_frames(middle)
     assert not fast_frames(drive).any()
-    # A turn in it makes the whole stretch fast.
+    # With a turn, the whole stretch is fast.
     turn = short.keep_tracks(abs(short.frame[short.offsets[:-1]] - 80) < 10)
     assert fast_frames(Tracks.concatenate(drive, *[turn.subsample_frames(middle)] * 40)).all()

@@ -1,4 +1,4 @@
-"""What joins neighbouring images of a model, and where it hardly does."""
+"""Seams: how many points join neighbouring images of a model."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _LEFT = 5
 _SOUND = 0.95
 
 
-def test_model_that_holds_together(made: ReconstructReport) -> None:
+def test_consistent_model_has_no_weak_seam(made: ReconstructReport) -> None:
     seams = model_seams(read_model(made.output / "sparse" / "0"))
     assert len(seams.pairs) == made.num_registered - 1
     assert seams.weak == []
     assert seams.warning is None
 
 
-def test_a_seam_that_few_points_hold(
+def test_seam_with_few_points_is_reported(
     made: ReconstructReport, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = read_model(made.output / "sparse" / "0")
@@ -58,14 +58,14 @@ def test_a_seam_that_few_points_hold(
     assert first in error
 
 
-def test_places_seen_again_do_not_join_what_lies_between(tmp_path: Path) -> None:
-    """Thirty images in a row; 100 points join neighbours, 500 are seen by the first and last."""
+def test_loop_closures_do_not_count_at_seams_inside_the_loop(tmp_path: Path) -> None:
+    """Thirty images in a row: 100 points join neighbours, 500 join the first and last images."""
     write_row(tmp_path, [[k, k + 1, k + 2] for k in range(28) for _ in range(100)], 500)
     found = model_seams(read_model(tmp_path)).num_points
     assert found.tolist() == [600, *[200] * 27, 600]
 
 
-def test_a_cut_is_no_weak_seam_where_its_sides_see_each_other_elsewhere(tmp_path: Path) -> None:
+def test_cut_is_no_weak_seam_if_a_loop_closure_joins_its_sides(tmp_path: Path) -> None:
     views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
     write_row(tmp_path, views, 20)
     assert model_seams(read_model(tmp_path)).weak == [14]
@@ -73,7 +73,7 @@ def test_a_cut_is_no_weak_seam_where_its_sides_see_each_other_elsewhere(tmp_path
     assert model_seams(read_model(tmp_path)).weak == []
 
 
-def test_images_with_cameras_of_their_own_have_seams(tmp_path: Path) -> None:
+def test_seams_are_found_with_a_camera_per_image(tmp_path: Path) -> None:
     views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
     write_row(tmp_path, views, 0, num_cameras=30)
     assert model_seams(read_model(tmp_path)).weak == [14]
@@ -84,8 +84,8 @@ def write_row(folder: Path, views: list[list[int]], again: int, *, num_cameras: 
 
     Args:
         folder: gets the model.
-        views: for points, which images see them.
-        again: further points, that the first two and the last two see.
+        views: for each point, the images that see it.
+        again: number of further points, seen by the first two and the last two images.
         num_cameras: 1 or 30.
     """
     cameras = {}
@@ -109,10 +109,10 @@ def write_row(folder: Path, views: list[list[int]], again: int, *, num_cameras: 
     write_model(folder, cameras, images, points)
 
 
-def test_parts_that_are_joined_wrongly(
+def test_wrongly_joined_parts_are_reported(
     made: ReconstructReport, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """All after the middle is turned about it, as where a mapper takes the wrong of two poses."""
+    """All images after the middle are rotated, as if a mapper chose the wrong of two poses."""
     model = read_model(made.output / "sparse" / "0")
     database = made.output / "database.db"
     sound = model_crossings(model, database)
@@ -144,14 +144,14 @@ def test_parts_that_are_joined_wrongly(
 def _walk_with_a_turn(
     folder: Path, degrees: float, aside: float = 0, rest: int = 0, *, back: bool = False
 ) -> list[str]:
-    """Write the model of a camera that walks, turns about itself and walks on.
+    """Write the model of a camera that walks, turns on the spot and walks on.
 
     Args:
         folder: gets the model.
-        degrees: by which it turns.
-        aside: how far it moves meanwhile.
-        rest: images before it walks.
-        back: it turns back afterwards, and walks on once more.
+        degrees: angle of the turn.
+        aside: distance moved during the turn.
+        rest: number of images before the camera moves.
+        back: whether the camera then turns back and walks on.
 
     Returns:
         The names of the images from the last before the turn to the first after it.
@@ -196,7 +196,7 @@ def _walk_with_a_turn(
 
 
 @pytest.mark.parametrize(("degrees", "aside", "rest"), [(25, 0.0, 0), (80, 1.0, 0), (25, 0.0, 10)])
-def test_turns_that_something_is_seen_across(
+def test_turn_keeps_the_scale_if_points_are_seen_across_it(
     tmp_path: Path, degrees: float, aside: float, rest: int
 ) -> None:
     _walk_with_a_turn(tmp_path, degrees, aside, rest)
@@ -205,7 +205,7 @@ def test_turns_that_something_is_seen_across(
     assert seams.warning is None
 
 
-def test_a_turn_by_all_that_is_seen_loses_the_scale(tmp_path: Path) -> None:
+def test_turn_wider_than_the_field_of_view_loses_the_scale(tmp_path: Path) -> None:
     turn = _walk_with_a_turn(tmp_path, degrees=80)
     seams = model_seams(read_model(tmp_path))
     assert seams.weak == []
@@ -219,10 +219,10 @@ def test_a_turn_by_all_that_is_seen_loses_the_scale(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("usual", "fewest", "is_lost"), [(730, 44, False), (730, 20, True), (468, 26, True)]
 )
-def test_many_points_carry_the_scale_however_many_are_usual(
+def test_enough_points_carry_the_scale_even_if_others_have_more(
     usual: int, fewest: int, is_lost: bool
 ) -> None:
-    """44 of 730 are those of a correct model of a walk, 26 of 468 of one that was bent."""
+    """44 of 730 occurred in a correct model of a walk, 26 of 468 in a bent one."""
     scaled = np.full(20, usual)
     scaled[10] = fewest
     pairs = tuple((f"{k}.png", f"{k + 1}.png") for k in range(20))
@@ -231,7 +231,7 @@ def test_many_points_carry_the_scale_however_many_are_usual(
     assert seams.unscaled == ([10] if is_lost else [])
 
 
-def test_a_place_seen_again_carries_no_scale_to_what_lies_between(tmp_path: Path) -> None:
+def test_loop_closure_carries_no_scale_across_a_turn_inside_the_loop(tmp_path: Path) -> None:
     turn = _walk_with_a_turn(tmp_path, degrees=80, back=True)
     seams = model_seams(read_model(tmp_path))
     lost = {seams.pairs[i] for i in seams.unscaled} & set(pairwise(turn))

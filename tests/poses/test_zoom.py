@@ -1,4 +1,4 @@
-"""A video whose focal length changes gets a camera for each image, and so does one on request."""
+"""A video that zooms gets a camera for each image, and so does any video on request."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ EVERY_FOURTH = MatchOptions(images=ImageOptions(every=4))
 
 @pytest.fixture(scope="module")
 def zooming(encode: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The rendered clip at half its size and with a steady zoom."""
+    """The rendered clip at half size with a steady zoom."""
     frames = [picture for _, picture in decode_frames(SCENE)]
     height, width = frames[0].shape[:2]
     centre = np.array([width - 1, height - 1]) / 2
@@ -53,8 +53,8 @@ def with_camera(camera: CameraOptions) -> ReconstructOptions:
     return replace(OPTIONS, match=MatchOptions(images=ImageOptions(every=5), camera=camera))
 
 
-def test_a_zoom_is_found(zooming: Path, truth: Truth, tmp_path: Path) -> None:
-    """With one camera the path would be off by thirty times as much."""
+def test_reconstruct_detects_a_zoom(zooming: Path, truth: Truth, tmp_path: Path) -> None:
+    """With a single camera the error of the path would be thirty times as large."""
     options = ReconstructOptions(match=EVERY_FOURTH)
     report = reconstruct(zooming, tmp_path / "out", options=options)
     model = read_model(report.output / "sparse" / "0")
@@ -72,7 +72,7 @@ def test_a_zoom_is_found(zooming: Path, truth: Truth, tmp_path: Path) -> None:
     assert dict(reconstruct_rows(report))["focal lengths"] == f"{shortest:.2f} to {longest:.2f} px"
 
 
-def test_a_zoom_is_found_by_match(zooming: Path, truth: Truth, tmp_path: Path) -> None:
+def test_match_detects_a_zoom(zooming: Path, truth: Truth, tmp_path: Path) -> None:
     database, images = tmp_path / "zoom.db", tmp_path / "images"
     match(database, zooming, image_path=images, options=EVERY_FOURTH)
     model = read_model(map_database(database, images, tmp_path / "models").model)
@@ -83,7 +83,7 @@ def test_a_zoom_is_found_by_match(zooming: Path, truth: Truth, tmp_path: Path) -
 
 
 def model_of(truth: Truth, frames: range) -> PosedModel:
-    """Exact poses, and points in front of all images, which see them up to some noise."""
+    """Exact poses, and points in front of all images with 0.3 px of noise."""
     rng = np.random.default_rng(0)
     poses = truth.cam_from_world[frames.start : frames.stop : frames.step]
     images = [ModelImage(i + 1, f"{i}.png", truth.camera.camera_id, p) for i, p in enumerate(poses)]
@@ -104,8 +104,8 @@ def model_of(truth: Truth, frames: range) -> PosedModel:
     return PosedModel({truth.camera.camera_id: truth.camera}, images, points)
 
 
-def test_a_point_behind_a_camera_is_no_zoom(truth: Truth, tmp_path: Path) -> None:
-    """COLMAP drops its observation, so the trial has fewer than the model."""
+def test_point_behind_a_camera_is_not_taken_for_a_zoom(truth: Truth, tmp_path: Path) -> None:
+    """COLMAP drops its observation, so the trial has fewer observations than the model."""
     model = model_of(truth, range(0, 60, 5))
     first = model.images[0]
     xyz = model.points.xyz.copy()
@@ -116,7 +116,7 @@ def test_a_point_behind_a_camera_is_no_zoom(truth: Truth, tmp_path: Path) -> Non
     assert found.model.cameras.keys() == model.cameras.keys()
 
 
-def test_a_camera_for_each_image_on_request(truth: Truth, tmp_path: Path) -> None:
+def test_each_image_gets_a_camera_on_request(truth: Truth, tmp_path: Path) -> None:
     options = with_camera(CameraOptions(single_camera=False))
     report = reconstruct(SCENE, tmp_path / "out", options=options)
     model = read_model(report.output / "sparse" / "0")
@@ -126,7 +126,7 @@ def test_a_camera_for_each_image_on_request(truth: Truth, tmp_path: Path) -> Non
     assert report.focal_lengths == pytest.approx([truth.camera.focal_length_x] * 2, rel=0.03)
 
 
-def test_given_intrinsics_stay(tmp_path: Path) -> None:
+def test_given_intrinsics_are_kept(tmp_path: Path) -> None:
     camera = CameraOptions("PINHOLE", "520,520,320,180", single_camera=False)
     report = reconstruct(SCENE, tmp_path / "out", options=with_camera(camera))
     model = read_model(report.output / "sparse" / "0")
@@ -134,7 +134,7 @@ def test_given_intrinsics_stay(tmp_path: Path) -> None:
     assert {tuple(camera.params) for camera in model.cameras.values()} == {(520, 520, 320, 180)}
 
 
-def test_without_an_adjustment_nothing_estimates_the_cameras() -> None:
+def test_cameras_per_image_need_the_adjustment() -> None:
     match = MatchOptions(camera=CameraOptions(single_camera=False))
     with pytest.raises(OptionError, match="--adjust 0"):
         ReconstructOptions(match=match, mapping=MapperOptions(adjust=False))
