@@ -24,13 +24,13 @@ STEP = 0.05  # between points of a surface
 
 
 def views(step: float, count: int = 8) -> list[PosedCamera]:
-    """A camera that moves to the right by steps."""
+    """A camera that moves to the right in equal steps."""
     poses = [np.column_stack([np.eye(3), [-step * i, 0, 0]]) for i in range(count)]
     return [PosedCamera(CAMERA, pose) for pose in poses]
 
 
 def seen(xyz: np.ndarray, images: list[PosedCamera], error: np.ndarray) -> ModelPoints:
-    """The points, each seen by all images."""
+    """A cloud whose points are observed by all images."""
     n, m = len(xyz), len(images)
     offsets = np.arange(n + 1) * m
     rgb = np.tile(np.array([200, 100, 50], np.uint8), (n, 1))
@@ -39,13 +39,13 @@ def seen(xyz: np.ndarray, images: list[PosedCamera], error: np.ndarray) -> Model
 
 
 def slope(depth: float, tilt: float = 0.5) -> np.ndarray:
-    """Points of a plane, evenly spread across it; its normal is (-tilt, 0, 1)."""
+    """Evenly spaced points of a plane with normal (-tilt, 0, 1)."""
     x, y = np.meshgrid(np.arange(-20, 21) * STEP, np.arange(-15, 16) * STEP)
     return np.column_stack([x.ravel(), y.ravel(), depth + tilt * x.ravel()])
 
 
 def turned(gaussians: Gaussians) -> np.ndarray:
-    """Rotation matrices of the quaternions."""
+    """The quaternions as rotation matrices."""
     w, x, y, z = gaussians.rotation.T
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -55,8 +55,8 @@ def turned(gaussians: Gaussians) -> np.ndarray:
     return np.stack(rows, axis=1).reshape(-1, 3, 3)
 
 
-def test_discs_lie_on_their_surface() -> None:
-    """They cover it at half the distance of neighbours, and are thin where depth is sure."""
+def test_gaussians_are_discs_on_the_surface() -> None:
+    """Their radius is half the distance of neighbours; they are thin where depth is certain."""
     images = views(0.5)
     xyz = slope(5.0)
     made = initial_gaussians(seen(xyz, images, np.full(len(xyz), 0.0)), images)
@@ -73,7 +73,7 @@ def test_discs_lie_on_their_surface() -> None:
     assert (made.scale[inner, 2] < 0.45 * across).all()
 
 
-def test_unknown_depth_is_thick_and_far_surfaces_are_coarse() -> None:
+def test_gaussians_are_thicker_at_unknown_depth_and_larger_far_away() -> None:
     images = views(0.5)
     near, far = slope(5.0, 0.0), 4 * slope(5.0, 0.0)
     error = np.concatenate([np.full(len(near), -1.0), np.full(len(far), 3.0)])
@@ -83,7 +83,7 @@ def test_unknown_depth_is_thick_and_far_surfaces_are_coarse() -> None:
     assert 3.5 < ratio < 4.5
 
 
-def test_coinciding_lone_and_unseen_points_have_sizes() -> None:
+def test_degenerate_points_get_finite_scales() -> None:
     images = views(0.1)
     behind = np.array([0.0, 0, -5])
     for xyz in ([[0.0, 0, 5]] * 3 + [behind], [[0.0, 0, 5]], [behind] * 2):
@@ -94,7 +94,7 @@ def test_coinciding_lone_and_unseen_points_have_sizes() -> None:
         assert np.isfinite(made.rotation).all()
 
 
-def test_layout_is_that_of_the_reference(tmp_path: Path) -> None:
+def test_ply_layout_matches_the_reference_implementation(tmp_path: Path) -> None:
     images = views(0.5)
     xyz = slope(5.0)
     made = initial_gaussians(seen(xyz, images, np.zeros(len(xyz))), images)
@@ -109,7 +109,7 @@ def test_layout_is_that_of_the_reference(tmp_path: Path) -> None:
     names = [line.split()[2] for line in lines[4:] if line]
     assert all(line.startswith("property float ") for line in lines[4:] if line)
     assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    # The reference implementation refuses any other number.
+    # The reference implementation requires exactly this number.
     rest = [name for name in names if name.startswith("f_rest_")]
     assert rest == [f"f_rest_{i}" for i in range(3 * (3 + 1) ** 2 - 3)]
     assert names[54:] == [
@@ -124,7 +124,7 @@ def test_layout_is_that_of_the_reference(tmp_path: Path) -> None:
     assert np.allclose(table[:, 58:], made.rotation, atol=1e-6)
 
 
-def test_files_that_cannot_be_made(tmp_path: Path) -> None:
+def test_unusable_output_paths_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"init\.txt"):
         check_gaussians_path(tmp_path / "init.txt", [])
     (tmp_path / "folder.ply").mkdir()

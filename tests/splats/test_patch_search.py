@@ -1,4 +1,4 @@
-"""Patches are found in another picture to small parts of a pixel."""
+"""The patch search finds patches in another image with subpixel accuracy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ UPRIGHT = np.array([[1, 0], [0, 1]], np.float32)
 
 
 def texture() -> NDArray[np.float32]:
-    """A picture with detail."""
+    """An image with fine texture."""
     rng = np.random.default_rng(2)
     noise = cv2.GaussianBlur(rng.normal(size=(SIZE, SIZE)).astype(np.float32), (0, 0), 1.8)
     return np.asarray(128 + 30 * noise / noise.std(), np.float32)
@@ -27,7 +27,7 @@ def grey(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def sought(source: NDArray[np.uint8], count: int) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Patches of a picture, and the pixels [n, 2] in their middles."""
+    """Patches of an image, and their centre pixels [n, 2]."""
     at = np.random.default_rng(3).integers(60, SIZE - 60, (count, 2))
     half = SIDE // 2
     return np.stack([source[y - half : y + half + 1, x - half : x + half + 1] for x, y in at]), at
@@ -46,14 +46,14 @@ def find(patches: NDArray[np.uint8], target: NDArray[np.uint8], start: Any, **ho
     return _core.find_patches(patches, given.pop("index"), **given)
 
 
-def test_patches_are_found_where_a_turned_picture_shows_them() -> None:
+def test_patches_are_found_in_a_rotated_image() -> None:
     whole = texture()
     patches, at = sought(grey(whole), 200)
     turn = cv2.getRotationMatrix2D((200.3, 199.4), 25.0, 1.1)
     target = grey(cv2.warpAffine(whole, turn, (SIZE, SIZE), flags=cv2.INTER_CUBIC))
     places = at @ turn[:, :2].T + turn[:, 2] + 0.5
     start = places + np.random.default_rng(4).uniform(-1.5, 1.5, places.shape)
-    # From pixels of the target to those of the patch.
+    # From target pixels to patch pixels.
     change = np.tile(np.linalg.inv(turn[:, :2]).astype(np.float32), (len(at), 1, 1))
     xy, missed, likeness = find(patches, target, start, change=change)
     found = missed <= 0.15
@@ -64,7 +64,7 @@ def test_patches_are_found_where_a_turned_picture_shows_them() -> None:
     assert np.quantile(likeness[found], 0.05) > 0.97
 
 
-def test_the_middle_may_lie_between_pixels() -> None:
+def test_patch_centre_may_lie_between_pixels() -> None:
     source = grey(texture())
     patches, at = sought(source, 50)
     middle = np.full((len(at), 2), (0.3, -0.4), np.float32)
@@ -74,7 +74,7 @@ def test_the_middle_may_lie_between_pixels() -> None:
     assert np.abs(xy - (at + 0.5 + middle))[found].max() < 0.1
 
 
-def test_what_is_not_there_is_not_found() -> None:
+def test_unmatched_patches_are_not_found() -> None:
     source = grey(texture())
     patches, at = sought(source, 50)
     flat = np.full_like(source, 128)
@@ -88,13 +88,13 @@ def test_what_is_not_there_is_not_found() -> None:
         _, missed, likeness = find(own, target, start)
         assert np.isinf(missed).all()
         assert (likeness == -1).all()
-    # Farther than it may move.
+    # The start is farther away than `max_move`.
     xy, missed, _ = find(patches, source, at + 1.5, max_move=0.5)
     assert (np.abs(xy - at - 1.5).max(axis=1) <= 0.5)[np.isfinite(missed)].all()
     assert np.isinf(missed).mean() > 0.9
 
 
-def test_arrays_that_do_not_fit_are_refused() -> None:
+def test_mismatched_arrays_are_refused() -> None:
     source = grey(texture())
     patches, at = sought(source, 3)
     start = at + 0.5

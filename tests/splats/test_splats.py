@@ -1,4 +1,4 @@
-"""Clouds for trainers of Gaussian splats: honest distances, even spacing, no holes."""
+"""Point clouds for training Gaussian splats: bounded depths, even spacing, no holes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def turning(degrees: float, count: int = NUM_VIEWS) -> np.ndarray:
 
 
 def scattered(count: int, depth: float | tuple[float, float], seed: int = 0) -> np.ndarray:
-    """Points that the first view sees."""
+    """Random points in the field of view of the first view."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-0.9, 0.9, (count, 2)) * (WIDTH / 2 / FOCAL, HEIGHT / 2 / FOCAL)
     low, high = depth if isinstance(depth, tuple) else (depth, depth)
@@ -55,7 +55,7 @@ def scattered(count: int, depth: float | tuple[float, float], seed: int = 0) -> 
 
 
 def see(xyz: np.ndarray, poses: np.ndarray, noise: float, seed: int = 0) -> Observations:
-    """Every view sees every point, with errors of so many pixels."""
+    """Observations of every point in every view, with noise in pixels."""
     own = np.einsum("vij,nj->nvi", poses[:, :, :3], xyz) + poses[:, :, 3]
     rays = own[:, :, :2] / own[:, :, 2:]
     rays = rays + np.random.default_rng(seed).normal(0, noise / FOCAL, rays.shape)
@@ -73,7 +73,7 @@ def tracks_of(points: TriangulatedPoints) -> np.ndarray:
     return points.observation[points.offsets[:-1]] // NUM_VIEWS
 
 
-def test_near_points_are_where_a_survey_has_them() -> None:
+def test_near_points_match_survey_points() -> None:
     poses = moving(0.2)
     seen = see(scattered(300, (3, 6)), poses, 0.1)
     points = splat_points(seen, views_of(poses), SPLATS)
@@ -84,8 +84,8 @@ def test_near_points_are_where_a_survey_has_them() -> None:
     assert np.array_equal(points.offsets, survey.offsets)
 
 
-def test_far_points_stay_on_their_ray_at_a_bounded_distance() -> None:
-    """A survey has none of them; their images do not tell how far they are."""
+def test_far_points_are_kept_at_a_bounded_distance() -> None:
+    """Survey points leave them out, because their distance is not observable."""
     poses = moving(0.02)
     near, far = scattered(300, (2, 6)), scattered(200, (500, 5000), seed=1)
     seen = see(np.concatenate([near, far]), poses, 0.3)
@@ -93,18 +93,18 @@ def test_far_points_stay_on_their_ray_at_a_bounded_distance() -> None:
     assert (tracks_of(survey) < 300).all()
     points = splat_points(seen, views_of(poses), SPLATS)
     track = tracks_of(points)
-    assert (track >= 300).sum() > 190  # some by parallel rays that meet nowhere
+    assert (track >= 300).sum() > 190  # including points whose rays are parallel
     distant = points.xyz[track >= 300]
     assert distant[:, 2].min() > 1.0
     assert np.isfinite(distant).all()
-    # Beyond the far field only as far as errors insist.
+    # They lie beyond the far field only as far as the reprojection error requires.
     assert np.quantile(distant[:, 2], 0.9) < 100
     assert points.error.max() < 2.0
     assert (np.diff(points.offsets) >= SPLATS.min_observations).all()
     assert (np.diff(track) >= 0).all()
 
 
-def test_a_camera_that_turns_on_the_spot_gets_a_sphere() -> None:
+def test_points_of_a_rotating_camera_lie_on_a_sphere() -> None:
     poses = turning(1.0)
     sky = scattered(200, 50.0)
     points = splat_points(see(sky, poses, 0.2), views_of(poses), SPLATS)
@@ -122,8 +122,8 @@ def test_no_tracks_give_no_points() -> None:
     assert len(splat_points(none, views_of(moving(0.2)), SPLATS).xyz) == 0
 
 
-def test_what_hangs_before_its_surroundings_goes() -> None:
-    """A lone point near the camera does; a pole of many points, and true neighbours, stay."""
+def test_floating_points_are_dropped() -> None:
+    """Lone points near the camera are dropped; a pole of many points and the wall are kept."""
     poses = moving(0.05)
     wall = scattered(2000, 8.0)
     pole = np.column_stack([np.full(60, 0.3), np.linspace(-0.6, 0.6, 60), np.full(60, 3.0)])
@@ -137,7 +137,7 @@ def test_what_hangs_before_its_surroundings_goes() -> None:
 
 
 def cloud(xyz: np.ndarray, views: list[PosedCamera]) -> ModelPoints:
-    """The points as all views have them that they project into; those without are left out."""
+    """A cloud whose points are observed by all views they project into, and by at least one."""
     seen = [(i, *view.project(xyz)[:2]) for i, view in enumerate(views)]
     point = np.concatenate([index for _, index, _ in seen])
     order = np.argsort(point, kind="stable")
@@ -154,8 +154,8 @@ def posed(poses: np.ndarray) -> list[PosedCamera]:
     return [PosedCamera(CAMERA, pose) for pose in poses]
 
 
-def test_points_become_even_and_holes_are_filled() -> None:
-    """Of a crowded half that much stays as the images tell apart; the other half gets points."""
+def test_dense_areas_are_thinned_and_holes_are_filled() -> None:
+    """The crowded half is thinned to the resolution of the images; the empty half gets points."""
     views = posed(moving(0.1))
     wall = scattered(20_000, 5.0)
     wall = np.concatenate([wall[wall[:, 0] < 0], [[2.0, 1.5, 5.0]]])
@@ -165,7 +165,7 @@ def test_points_become_even_and_holes_are_filled() -> None:
     is_new = made.error < 0
     assert coverage(views, made.xyz) > 0.99
     assert 300 < (~is_new).sum() < 3000 < len(given.xyz)
-    # The holes are as deep as the wall, and seen by images.
+    # New points have the depth of the wall and are observed by images.
     assert np.allclose(made.xyz[is_new, 2], 5.0)
     assert (np.diff(made.offsets) >= 1).all()
     for i, view in enumerate(views):
@@ -181,8 +181,8 @@ def test_points_become_even_and_holes_are_filled() -> None:
     )
 
 
-def test_what_is_seen_through_a_hole_that_is_filled_is_no_hole() -> None:
-    """A far point amid a hole of a near wall is hidden once there are points around it."""
+def test_point_behind_a_filled_hole_leaves_no_hole() -> None:
+    """A far point seen through a hole in a near wall is hidden once the hole is filled."""
     views = posed(moving(0.0, 1))
     x, y = np.meshgrid(np.arange(4.0, WIDTH, 8), np.arange(4.0, HEIGHT, 8))
     hole = (np.abs(x // 16 - 10) <= 1) & (np.abs(y // 16 - 7) <= 1)
@@ -194,7 +194,7 @@ def test_what_is_seen_through_a_hole_that_is_filled_is_no_hole() -> None:
 
 
 @pytest.mark.parametrize("max_points", [100, 500, 1000])
-def test_a_bound_on_the_number_keeps_the_coverage(max_points: int) -> None:
+def test_max_points_keeps_the_coverage(max_points: int) -> None:
     views = posed(moving(0.1))
     given = cloud(scattered(20_000, 5.0), views)
     made = splat_cloud(given, views, max_points)
@@ -202,7 +202,7 @@ def test_a_bound_on_the_number_keeps_the_coverage(max_points: int) -> None:
     assert coverage(views, made.xyz) > {100: 0.25, 500: 0.75, 1000: 0.96}[max_points]
 
 
-def test_surfaces_behind_each_other_both_stay() -> None:
+def test_overlapping_surfaces_are_both_kept() -> None:
     views = posed(moving(0.3, 24))
     front, back = scattered(4000, 4.0), scattered(4000, 40.0, seed=1)
     made = splat_cloud(cloud(np.concatenate([front, back]), views), views, None)
@@ -210,8 +210,8 @@ def test_surfaces_behind_each_other_both_stay() -> None:
     assert (made.xyz[:, 2] == 40.0).sum() > 500
 
 
-def test_holes_beside_an_edge_lie_with_what_is_behind() -> None:
-    """So that nothing that is added hides what other images see."""
+def test_holes_next_to_an_edge_are_filled_at_the_background() -> None:
+    """Otherwise new points would occlude what other images observe."""
     views = posed(moving(0.2))
     front = scattered(3000, 2.0)
     back = scattered(3000, 20.0, seed=1)
@@ -224,8 +224,8 @@ def test_holes_beside_an_edge_lie_with_what_is_behind() -> None:
     assert np.mean(between[:, 2] > 15) > 0.9
 
 
-def test_no_points_at_all() -> None:
-    """Then the images get a wall before them, and no error."""
+def test_images_without_points_get_a_wall() -> None:
+    """An empty cloud is filled with points in front of the cameras."""
     views = posed(moving(0.1))
     none = ModelPoints(
         np.empty((0, 3)),
@@ -239,7 +239,7 @@ def test_no_points_at_all() -> None:
     assert coverage(views, made.xyz) > 0.99
 
 
-def test_options_that_cannot_work() -> None:
+def test_invalid_options_are_refused() -> None:
     with pytest.raises(OptionError, match="max_points"):
         TriangulateOptions(max_points=99)
     with pytest.raises(OptionError, match="max_points"):
@@ -250,7 +250,7 @@ def test_options_that_cannot_work() -> None:
         TriangulateOptions(points="survey", **given)
 
 
-def test_centres_are_where_cameras_are() -> None:
+def test_camera_centres_are_correct() -> None:
     poses = turning(20.0)
     poses[:, :, 3] = np.arange(24).reshape(8, 3)
     for view, centre in zip(posed(poses), camera_centres(poses), strict=True):
@@ -258,7 +258,7 @@ def test_centres_are_where_cameras_are() -> None:
 
 
 def given_to_core(num_points: int) -> dict[str, np.ndarray]:
-    """Points, each of which every view sees, as the core takes them."""
+    """Arguments of the core functions for points that every view observes."""
     poses = moving(0.2)
     truth = scattered(num_points, 3.0)
     seen = see(truth, poses, 0.0)
@@ -291,7 +291,7 @@ HANGING = {"before": 0.7, "as_near": 1.1, "support": 2, "around": 1000.0, "fewes
         ("cam_from_world", lambda poses: poses[:1]),
     ],
 )
-def test_points_that_the_core_is_given_must_fit(name: str, wrong: Callable[..., object]) -> None:
+def test_core_refuses_mismatched_arrays_of_points(name: str, wrong: Callable[..., object]) -> None:
     given = given_to_core(5)
     assert np.abs(_core.reprojection_errors(**given)).max() < 1e-9
     assert _core.hanging_observations(**given, **HANGING).tolist() == [0] * 5
@@ -307,10 +307,10 @@ def test_points_that_the_core_is_given_must_fit(name: str, wrong: Callable[..., 
             _core.widest_angles(centres=centres, **rest)
 
 
-def test_what_is_no_number_tells_the_core_nothing() -> None:
+def test_core_ignores_nan() -> None:
     given = given_to_core(5)
-    given["xyz"][0] *= 0.3  # hangs before the others
-    given["rays"] += 1.0  # all in one square
+    given["xyz"][0] *= 0.3  # floats in front of the others
+    given["rays"] += 1.0  # all in one grid cell
     counts = _core.hanging_observations(**given, **HANGING)
     assert counts.tolist() == [NUM_VIEWS, 0, 0, 0, 0]
     given["rays"][0] = np.nan
@@ -329,7 +329,7 @@ def test_what_is_no_number_tells_the_core_nothing() -> None:
         _core.hanging_observations(**given, **HANGING | {"around": 0.0})
 
 
-def test_surfaces_that_the_core_is_given_must_fit() -> None:
+def test_core_refuses_mismatched_arrays_of_surfaces() -> None:
     xy, depth = np.array([[3.0, 4.0], [5.0, 4.0]]), np.array([2.0, 2.1])
     limits = {"width": 8, "height": 8, "steps_per_octave": 2.0, "most_steps": 64}
     spacings, rank = np.array([8, 2]), np.array([1, 0])
@@ -341,7 +341,7 @@ def test_surfaces_that_the_core_is_given_must_fit() -> None:
     for beyond in (np.inf, np.nan, 0.0):
         with pytest.raises(ValueError, match="outside"):
             _core.best_at_spacings(xy, np.full(2, beyond), rank, spacings=spacings, **limits)
-    # Steps beyond all bounds are one surface.
+    # With extremely many steps per octave, the surfaces are not separated.
     limits["steps_per_octave"] = 1e308
     steep = _core.best_at_spacings(xy, depth * 8, rank, spacings=spacings, **limits)
     assert steep.tolist() == [1, 0]

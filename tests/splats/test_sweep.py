@@ -1,4 +1,4 @@
-"""Points where no track is: true depths, only where pictures show them, and nothing hidden."""
+"""The plane sweep adds points where there are no tracks: correct depths, nothing occluded."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ CAMERA = pycolmap.Camera(
     camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, FOCAL, 160, 120]
 )
 NUM_VIEWS, STEP = 9, 0.27
-# A square before a wall, its centre and half of its width; the right part of the wall is plain.
+# A square in front of a wall: depths, centre and half width; the right of the wall is untextured.
 NEAR, FAR, CENTRE, HALF, PLAIN_FROM = 3.0, 10.0, 1.08, 0.4, 4.0
-# Columns of the square that a mask of it lacks.
+# Columns of the square that its mask leaves uncovered.
 EDGE = 14
 PIXELS_PER_UNIT = {NEAR: 250.0, FAR: 50.0}
 
@@ -35,7 +35,7 @@ def texture(seed: int) -> np.ndarray:
 
 
 def show(x_camera: float) -> np.ndarray:
-    """The picture of a camera that looks along z from (x, 0, 0)."""
+    """Render the image of a camera at (x, 0, 0) that looks along z."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     ray = np.stack([(x - 160) / FOCAL, (y - 120) / FOCAL], axis=-1)
     shown = {}
@@ -58,9 +58,9 @@ ONE_VIDEO = np.zeros(NUM_VIEWS, np.int32)
 
 
 def on_wall(*, through: bool = False) -> ModelPoints:
-    """Tracks of the wall where it is not plain, in every image that shows them.
+    """Tracks of the textured wall in every image that shows them.
 
-    With `through` images show them where the square is before them, too.
+    With `through`, the square does not occlude them.
     """
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-6, 8, 0.2), np.arange(-5, 5, 0.2)))
     xyz = np.column_stack([x, y, np.full(len(x), FAR)])
@@ -88,10 +88,10 @@ def sweep(
         return found.result()
 
 
-def test_what_no_track_shows_is_found_where_it_is() -> None:
+def test_sweep_finds_an_object_without_tracks() -> None:
     found = sweep(on_wall())
     assert len(found.xyz) > 100
-    # On the square, and nowhere on what is plain.
+    # On the square only, and not on the untextured wall.
     assert (np.abs(found.xyz[:, :2] - (CENTRE, 0)) < HALF + 0.03).all()
     assert np.abs(found.xyz[:, 2] / NEAR - 1).max() < 0.03
     assert np.diff(found.offsets).min() >= 3
@@ -101,19 +101,19 @@ def test_what_no_track_shows_is_found_where_it_is() -> None:
     assert np.quantile(apart, 0.9) < 0.3
     mean = np.bincount(owner, weights=apart) / np.diff(found.offsets)
     np.testing.assert_allclose(found.error, mean, atol=1e-9)
-    # By points, and within these by images.
+    # Sorted by point, then by image.
     assert (np.diff(owner * NUM_VIEWS + found.image) > 0).all()
 
 
-def test_the_number_of_threads_does_not_change_it() -> None:
+def test_result_does_not_depend_on_the_number_of_threads() -> None:
     one = sweep(on_wall(), num_threads=1)
     two = sweep(on_wall())
     for a, b in zip(vars(one).values(), vars(two).values(), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_nothing_hides_what_tracks_show() -> None:
-    # Only every other image is looked at: the tracks of those between see through the square.
+def test_new_points_do_not_occlude_tracks() -> None:
+    # The sweep uses every other image; the tracks of the images between see through the square.
     points, hidden = on_wall(), on_wall(through=True)
     mixed = [hidden if i % 2 else points for i in range(NUM_VIEWS)]
     rows = [
@@ -131,18 +131,18 @@ def test_nothing_hides_what_tracks_show() -> None:
     assert len(sweep(replace(points, offsets=offsets, image=image, xy=xy)).xyz) == 0
 
 
-def test_only_pictures_of_one_video_are_compared() -> None:
+def test_images_of_different_videos_are_not_compared() -> None:
     assert len(sweep(on_wall(), image_set=np.arange(NUM_VIEWS, dtype=np.int32)).xyz) == 0
 
 
-def test_what_masks_leave_out_is_not_looked_for() -> None:
+def test_nothing_is_found_on_masks() -> None:
     kept = np.zeros((HEIGHT, WIDTH), np.bool_)
     views = [replace(view, mask=make_mask(kept)) for view in VIEWS]
     assert len(sweep(on_wall(), views=views).xyz) == 0
 
 
-def test_nothing_is_found_beside_masks() -> None:
-    """Masks of the square that leave out all of it but an edge."""
+def test_nothing_is_found_next_to_masks() -> None:
+    """The masks cover the square except for an edge."""
     views = []
     for number, view in enumerate(VIEWS):
         low, high = (
@@ -154,18 +154,18 @@ def test_nothing_is_found_beside_masks() -> None:
         views.append(replace(view, mask=make_mask(kept)))
     on_square = np.abs(sweep(on_wall()).xyz[:, 2] - NEAR) < 0.5
     assert on_square.sum() > 20
-    beside = sweep(on_wall(), views=views)
-    assert not (np.abs(beside.xyz[:, 2] - NEAR) < 0.5).any()
+    masked = sweep(on_wall(), views=views)
+    assert not (np.abs(masked.xyz[:, 2] - NEAR) < 0.5).any()
 
 
 @pytest.mark.parametrize("left", [[], [0], [0, 1], [0, 1, 2, 7], range(5)])
-def test_missing_pictures_are_not_looked_at(left: list[int]) -> None:
+def test_missing_pictures_are_not_used(left: list[int]) -> None:
     found = sweep(on_wall(), [(i, PICTURES[i]) for i in left])
     assert set(found.image.tolist()) <= set(left)
     assert (len(found.xyz) > 0) == (len(left) > 2)
 
 
-def test_no_points_or_one_image_give_none() -> None:
+def test_no_points_or_a_single_image_give_no_points() -> None:
     assert len(sweep(no_points()).xyz) == 0
     one = sweep(no_points(), [(0, PICTURES[0])], VIEWS[:1], ONE_VIDEO[:1])
     assert len(one.xyz) == 0
@@ -178,10 +178,10 @@ def patch(picture: np.ndarray, x: float, y: float) -> np.ndarray:
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_correlations_are_those_of_the_patches(seed: int) -> None:
+def test_correlations_match_numpy(seed: int) -> None:
     rng = np.random.default_rng(seed)
     one, two = rng.integers(0, 256, (2, 20, 24), dtype=np.uint8)
-    # Sixty-fourths are exact in OpenCV's table of weights where they are multiples of two.
+    # Multiples of 1/32 are exact in OpenCV's table of interpolation weights.
     at_one = (rng.integers(5 * 32, 15 * 32, (3, 2)) / 32).astype(np.float32)
     at_two = (rng.integers(5 * 32, 15 * 32, (3, 4, 2)) / 32).astype(np.float32)
     found = _core.correlate_patches(one, at_one, two, at_two, min_deviation=0.0)
@@ -192,7 +192,7 @@ def test_correlations_are_those_of_the_patches(seed: int) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
-def test_patches_beyond_the_picture_or_plain_ones_do_not_correlate() -> None:
+def test_patches_outside_the_image_or_without_texture_do_not_correlate() -> None:
     picture = np.random.default_rng(0).integers(0, 256, (20, 24), dtype=np.uint8)
     middle = np.array([[12, 10]], np.float32)
 
@@ -208,7 +208,7 @@ def test_patches_beyond_the_picture_or_plain_ones_do_not_correlate() -> None:
     assert of((12, 10), deviation=1e3) == -1.0
 
 
-def test_arrays_that_do_not_fit_are_refused() -> None:
+def test_mismatched_arrays_are_refused() -> None:
     picture, at = np.zeros((20, 24), np.uint8), np.zeros((3, 2), np.float32)
     with pytest.raises(ValueError, match="lengths"):
         _core.correlate_patches(
