@@ -1,4 +1,4 @@
-"""Corners are followed to where the pictures show them, with a hint from tracks."""
+"""Corners are tracked in the pictures, with tracks as a guide."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BORDER = 200
 
 
 def texture(seed: int) -> NDArray[np.uint8]:
-    """A picture with detail at several scales, larger than what is shown of it."""
+    """A texture with detail at several scales, larger than the views of it."""
     rng = np.random.default_rng(seed)
     shape = (SIZE[1] + 2 * BORDER, SIZE[0] + 2 * BORDER)
     sum_of = np.zeros(shape)
@@ -26,7 +26,7 @@ def texture(seed: int) -> NDArray[np.uint8]:
 
 
 def view(whole: NDArray[np.uint8], shift: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """What is shown when the content has moved by a shift in pixels, BGR."""
+    """A BGR view of the texture, shifted by some pixels."""
     move = np.array([[1.0, 0, shift[0] - BORDER], [0, 1.0, shift[1] - BORDER]])
     return cv2.cvtColor(
         cv2.warpAffine(whole, move, SIZE, flags=cv2.INTER_CUBIC), cv2.COLOR_GRAY2BGR
@@ -34,7 +34,7 @@ def view(whole: NDArray[np.uint8], shift: NDArray[np.float64]) -> NDArray[np.uin
 
 
 def guide_along(shifts: NDArray[np.float64], starts: NDArray[np.float64]) -> Tracks:
-    """Tracks that start at some points and move with the content."""
+    """Tracks that start at the given points and move with the texture."""
     xy = (starts[:, None] + shifts[None]).reshape(-1, 2).astype(np.float32)
     n, length = len(starts), len(shifts)
     return Tracks(
@@ -54,7 +54,7 @@ def all_count(_: int, xy: NDArray[np.float32], __: tuple[int, int]) -> NDArray[n
 
 
 def motion_of(tracks: Tracks, shifts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far each observation lies from where the content has moved since the first one."""
+    """Distance of each observation from the true motion since the first one, in pixels."""
     first = np.repeat(tracks.offsets[:-1], tracks.lengths)
     moved = shifts[tracks.frame] - shifts[tracks.frame[first]]
     return np.linalg.norm(tracks.xy - tracks.xy[first] - moved, axis=1)
@@ -64,7 +64,7 @@ SLOW = np.array([[0.0, 0], [3.3, -1.2], [7.1, 0.4], [10.9, 2.8], [13.2, 6.6]])
 STARTS = np.array([[80.0, 60], [160, 120], [240, 180]])
 
 
-def test_corners_lie_where_the_pictures_show_them() -> None:
+def test_corners_follow_the_texture() -> None:
     whole = texture(1)
     pictures = [(f, view(whole, s)) for f, s in enumerate(SLOW)]
     found = follow_corners(guide_along(SLOW, STARTS), pictures, all_count)
@@ -74,7 +74,7 @@ def test_corners_lie_where_the_pictures_show_them() -> None:
     assert found.confirmed.all()
 
 
-def test_a_jump_is_followed_where_tracks_say_it() -> None:
+def test_large_jump_is_followed_with_the_guide() -> None:
     shifts = np.array([[0.0, 0], [2, 1], [92, -61], [95, -60]])
     whole = texture(2)
     pictures = [(f, view(whole, s)) for f, s in enumerate(shifts)]
@@ -85,7 +85,7 @@ def test_a_jump_is_followed_where_tracks_say_it() -> None:
     assert np.percentile(motion_of(found, shifts), 95) < 0.1
 
 
-def test_what_does_not_count_holds_no_corner() -> None:
+def test_corners_are_only_found_where_allowed() -> None:
     whole = texture(3)
     pictures = [(f, view(whole, s)) for f, s in enumerate(SLOW)]
 
@@ -97,7 +97,7 @@ def test_what_does_not_count_holds_no_corner() -> None:
     assert found.xy[:, 0].min() >= SIZE[0] / 2
 
 
-def test_large_pictures_are_followed_in_their_own_pixels() -> None:
+def test_corners_of_large_pictures_are_in_full_size_pixels() -> None:
     shifts = SLOW * 5
     pictures = []
     whole = texture(4)
@@ -110,7 +110,7 @@ def test_large_pictures_are_followed_in_their_own_pixels() -> None:
     assert np.percentile(motion_of(found, shifts), 95) < 0.5
 
 
-def test_more_corners_are_followed_where_more_are_wanted() -> None:
+def test_density_sets_the_number_of_corners() -> None:
     pictures = [(k, view(texture(1), shift)) for k, shift in enumerate(SLOW)]
     few, many = (
         follow_corners(guide_along(SLOW, STARTS), pictures, all_count, density=density)
@@ -122,7 +122,7 @@ def test_more_corners_are_followed_where_more_are_wanted() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_few_or_plain_pictures_give_no_tracks(count: int) -> None:
+def test_too_few_or_untextured_pictures_give_no_tracks(count: int) -> None:
     whole = texture(5)
     shown = [(f, view(whole, s)) for f, s in enumerate(SLOW[:count])]
     guide = guide_along(SLOW, STARTS)

@@ -1,4 +1,4 @@
-"""Tracks of the rendered clip against its exact truth, and the metrics against known cases."""
+"""Tracks of the rendered clip compared with the ground truth, and metrics with known cases."""
 
 import functools
 import json
@@ -62,7 +62,7 @@ def _tracks(size, offsets, frame, xy):
 
 @pytest.fixture(scope="module")
 def true_tracks(scene):
-    """Surface points followed exactly, from frame 10 to 20."""
+    """Exact tracks of surface points from frame 10 to 20."""
     rng = np.random.default_rng(1)
     points = render_scene.surface_points(scene, 15, rng.uniform(100, 260, (300, 2)))
     frames = np.arange(10, 21)
@@ -79,7 +79,7 @@ def refined(tracks):
     return refine_tracks(tracks, decode_frames(EXAMPLES / "scene.mp4"), RefineOptions(refine="lk"))
 
 
-# By span: median and 90th percentile in px, some 15 % above what is reached.
+# Limits by span: median and 90th percentile in px, about 15 % above the measured values.
 EXACT = {1: (0.091, 0.33), 4: (0.16, 0.85), 16: (0.33, 2.4)}
 REFINED = {1: (0.097, 0.28), 4: (0.146, 0.56), 16: (0.3, 1.83)}
 TRUSTED = {1: (0.089, 0.2), 4: (0.134, 0.39), 16: (0.28, 1.38)}
@@ -95,31 +95,31 @@ def _check(tracks, transfer, span, limits):
 
 
 @pytest.mark.parametrize("span", EXACT)
-def test_tracks_keep_to_their_surface_points(tracks, transfer, span):
+def test_tracks_follow_surface_points(tracks, transfer, span):
     _check(tracks, transfer, span, EXACT)
 
 
 @pytest.mark.parametrize("span", REFINED)
-def test_refined_tracks_keep_closer(refined, transfer, span):
+def test_refined_tracks_are_more_accurate(refined, transfer, span):
     _check(refined, transfer, span, REFINED)
 
 
 @pytest.mark.parametrize("span", TRUSTED)
-def test_tracks_chosen_for_poses_keep_closest(refined, transfer, span):
+def test_selected_tracks_are_most_accurate(refined, transfer, span):
     chosen = select_tracks(refined, DensityOptions(preset="sparse"))
     _check(chosen, transfer, span, TRUSTED)
 
 
 @pytest.mark.parametrize("kind", ["tracks", "refined"])
 def test_tracks_are_not_biased(kind, transfer, request):
-    # Half a pixel between two conventions would show in every long track.
+    # Mixing two pixel conventions would cause a bias of half a pixel.
     errors = exact_errors(request.getfixturevalue(kind), transfer, 1, max_pairs=15_000)
     assert np.abs(errors.mean(0)).max() <= 0.05
     assert np.abs(np.median(errors, axis=0)).max() <= 0.01
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_positions_off_by_two_pixels_would_show(tracks, scene, camera, axis):
+def test_epipolar_error_detects_a_shift_of_two_pixels(tracks, scene, camera, axis):
     def median(shift):
         moved = tracks.xy + np.float32(shift) * np.eye(2, dtype=np.float32)[axis]
         moved = Tracks(**{**vars(tracks), "xy": moved})
@@ -131,21 +131,21 @@ def test_positions_off_by_two_pixels_would_show(tracks, scene, camera, axis):
 def test_true_tracks_have_no_error(true_tracks, scene, camera, transfer):
     for span in (1, 4, 10):
         errors = exact_errors(true_tracks, transfer, span)
-        # Single precision; next to an edge it may make the truth see another surface.
+        # Positions have single precision: next to an edge the truth may be on another surface.
         assert np.quantile(np.abs(errors), 0.98) < 1e-3
         assert epipolar_errors(true_tracks, scene.cam_from_world, camera, span).max() < 1e-3
     assert len(exact_errors(true_tracks, transfer, 11)) == 0
     assert len(epipolar_errors(true_tracks, scene.cam_from_world, camera, 11)) == 0
 
 
-def test_errors_are_those_put_in(true_tracks, scene, camera, transfer):
-    # Each observation is 0.3 px right and 0.1 px up of the one before.
+def test_known_drift_is_measured(true_tracks, scene, camera, transfer):
+    # Each observation drifts by 0.3 px to the right and 0.1 px up.
     drift = (true_tracks.frame - 10)[:, None] * np.float32([0.3, -0.1])
     moved = Tracks(**{**vars(true_tracks), "xy": true_tracks.xy + drift})
     errors = exact_errors(moved, transfer, 1)
     np.testing.assert_allclose(np.median(errors, axis=0), [0.3, -0.1], atol=0.02)
-    # The camera moves to the side: the way across the epipolar line is up and down. The
-    # distance is shared between the two views.
+    # The camera moves sideways, so epipolar lines are nearly horizontal. The distance is shared
+    # between the two views.
     distance = np.median(epipolar_errors(moved, scene.cam_from_world, camera, 1))
     assert 0.1 / np.sqrt(2) * 0.8 < distance < np.hypot(0.3, 0.1) / np.sqrt(2)
 
@@ -154,12 +154,12 @@ def test_epipolar_error_needs_poses(true_tracks, scene, camera):
     poses = scene.cam_from_world.copy()
     poses[15:] = np.nan
     some = epipolar_errors(true_tracks, poses, camera, 2)
-    assert len(some) == 3 * true_tracks.num_tracks  # from 10, 11 and 12
+    assert len(some) == 3 * true_tracks.num_tracks  # starting in frames 10, 11 and 12
     poses[:] = poses[0]
     assert len(epipolar_errors(true_tracks, poses, camera, 2)) == 0
 
 
-def test_pairs_at_span_are_all_pairs_and_only_these():
+def test_pairs_at_span_are_complete():
     frame = np.array([0, 1, 3, 1, 3, 5, 0, 4, 5], dtype=np.int32)
     offsets = np.array([0, 3, 6, 9])
     xy = np.zeros((9, 2), np.float32)
@@ -178,7 +178,7 @@ def test_pairs_at_span_are_all_pairs_and_only_these():
     np.testing.assert_array_equal(some, pairs_at_span(tracks, 2, max_pairs=1))
 
 
-def test_track_statistics_count_what_images_see():
+def test_track_statistics_count_observations_in_images():
     # Three frames of 2x1 cells; the second cell is cut at 20 px.
     frame = np.array([0, 1, 2, 0, 2, 1], dtype=np.int32)
     xy = np.float32([[1, 1], [2, 2], [17, 3], [18, 9], [19, 9], [20, 10]])
@@ -188,12 +188,12 @@ def test_track_statistics_count_what_images_see():
     assert all_frames.tracks_by_length == {2: 2, 4: 0, 8: 0, 16: 0, 32: 0}
     assert all_frames.observations_per_image == (pytest.approx(5 / 3), 1)
     assert all_frames.coverage == (pytest.approx((2 + 1 + 1) / 6), 0.5)
-    # Of frames 0 and 1 only one track sees both.
+    # Only one track is observed in both frames 0 and 1.
     two = track_statistics(tracks, np.array([0, 1]))
     assert (two.num_images, two.num_tracks, two.coverage) == (2, 1, (0.5, 0.5))
 
 
-def test_pose_errors_undo_a_similarity_and_show_the_rest(scene):
+def test_pose_errors_are_invariant_to_a_similarity(scene):
     truth = scene.cam_from_world
     similarity = pycolmap.Sim3d(
         2.5, pycolmap.Rotation3d(np.array([0.1, 0.5, -0.2, 0.8])), [1, 2, 3]
@@ -208,7 +208,7 @@ def test_pose_errors_undo_a_similarity_and_show_the_rest(scene):
     assert exact.relative_translation < 1e-9
     assert exact.relative_rotation < 1e-5
 
-    # One camera 0.3 m off, one turned by 2 degrees, one missing.
+    # One camera is shifted by 0.3 m, one is rotated by 2 degrees, one is missing.
     off = truth.copy()
     off[7, :, 3] += [0, 0.3, 0]
     off[9] = Rotation.from_rotvec([0, np.radians(2), 0]).as_matrix() @ off[9]
@@ -219,13 +219,13 @@ def test_pose_errors_undo_a_similarity_and_show_the_rest(scene):
     assert errors.ate == pytest.approx(0.3 / np.sqrt(59), rel=0.1)
     assert errors.max_rotation == pytest.approx(2, rel=0.05)
     assert errors.rotation < 0.05
-    # Both motions that meet in the turned camera are wrong; 58 lead from a pose to the next.
+    # The two motions at the rotated camera are wrong, of 58 between consecutive poses.
     assert errors.relative_rotation == pytest.approx(2 * np.sqrt(2 / 58), rel=0.01)
     assert errors.relative_translation == pytest.approx(0.3 * np.sqrt(2 / 58), rel=0.3)
     centres = -np.einsum("nij,ni->nj", truth[:, :, :3], truth[:, :, 3])
     assert errors.extent == pytest.approx(np.linalg.norm(np.ptp(centres, axis=0)), rel=0.01)
 
-    # The robust alignment ignores a pose that is far off, and its distance still counts.
+    # The robust alignment ignores an outlier, but the error includes its distance.
     off[3, :, 3] += [0, 0, 100]
     far = pose_errors(off, truth)
     assert far.robust_median < 0.01
@@ -245,7 +245,7 @@ def _write_sequence(folder, truth, **about):
     (folder / "groundtruth.txt").write_text(truth)
 
 
-def test_sequence_has_cameras_from_world(tmp_path):
+def test_sequence_poses_are_cam_from_world(tmp_path):
     half = np.sqrt(0.5)
     truth = f"# name tx ty tz qx qy qz qw\n000001.png 1 2 3 0 0 {half} {half}\n"
     params = [50, 51, 32, 24]
@@ -260,7 +260,7 @@ def test_sequence_has_cameras_from_world(tmp_path):
     np.testing.assert_allclose(pose @ [1, 3, 3, 1], [1, 0, 0], atol=1e-9)
 
 
-def test_bad_sequences_say_what_is_wrong(tmp_path):
+def test_invalid_sequences_are_refused(tmp_path):
     with pytest.raises(VideoError, match=r"sequence\.json"):
         read_sequence(tmp_path)
     _write_sequence(tmp_path, "000003.png 0 0 0 0 0 0 1\n")
@@ -272,7 +272,7 @@ def test_bad_sequences_say_what_is_wrong(tmp_path):
 
 
 @pytest.mark.shared
-def test_street_moves_forward(shared):
+def test_street_sequence_moves_forward(shared):
     street = read_sequence(shared / "sequences" / "street")
     moved = street.cam_from_world[0, :, :3] @ (
         -street.cam_from_world[5, :, :3].T @ street.cam_from_world[5, :, 3]

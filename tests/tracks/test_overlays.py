@@ -44,12 +44,12 @@ def moving(step: float, length: int) -> np.ndarray:
     num_still=st.integers(1, 4),
     at_rest=st.integers(0, 30),
 )
-def test_only_what_stands_still_before_a_moving_picture_goes(
+def test_only_still_tracks_in_a_moving_picture_are_removed(
     step: float, length: int, num_still: int, at_rest: int
 ) -> None:
     still = [(at_rest, np.full((length, 2), 50.0 + i)) for i in range(num_still)]
     others = [(at_rest, moving(step, length)) for _ in range(num_still + 1)]
-    # Tracks of the frames before, in which the camera rests.
+    # Tracks of the preceding frames, in which the camera does not move.
     resting = [(0, np.full((at_rest, 2), 9.0))] * (at_rest > 1)
     tracks = make_tracks(still + others + resting, at_rest + length)
     kept = remove_overlays(tracks)
@@ -61,8 +61,8 @@ def test_only_what_stands_still_before_a_moving_picture_goes(
         assert kept is tracks
 
 
-def test_the_way_between_kept_frames_counts() -> None:
-    """Where observations of every fifth frame are kept, the picture moves as far as in all."""
+def test_motion_is_measured_between_kept_frames() -> None:
+    """With observations in every fifth frame only, the total motion is the same."""
     paths = [(0, np.full((21, 2), 50.0)), (0, moving(0.25, 21)), (0, moving(0.25, 21))]
     tracks = make_tracks(paths, 21)
     some = tracks.keep_frames(np.arange(0, 21, 5, dtype=np.int32))
@@ -71,13 +71,13 @@ def test_the_way_between_kept_frames_counts() -> None:
     np.testing.assert_array_equal(kept.xy, some.xy[5:])
 
 
-def test_no_tracks() -> None:
+def test_no_tracks_remain_no_tracks() -> None:
     none = remove_overlays(Tracks.empty(5, (640, 480)))
     assert none.offsets.tolist() == [0]
 
 
 @pytest.mark.slow
-def test_logo_over_a_clip(tmp_path: Path) -> None:
+def test_tracks_on_a_logo_are_removed(tmp_path: Path) -> None:
     logo = np.zeros((80, 160, 4), dtype=np.uint8)
     cv2.putText(logo, "LOGO", (8, 60), cv2.FONT_HERSHEY_SIMPLEX, 1.8, (255, 255, 255, 255), 8)
     cv2.imwrite(str(tmp_path / "logo.png"), logo)
@@ -95,7 +95,7 @@ def test_logo_over_a_clip(tmp_path: Path) -> None:
         return int(np.count_nonzero(inside & (np.abs(end - begin).max(axis=1) <= 0.05)))
 
     assert still_in_logo(tracks) > 20
-    # A few move a little to and fro.
+    # A few tracks on the logo jitter slightly.
     assert still_in_logo(kept) < 0.15 * still_in_logo(tracks)
     num_left_out = tracks.num_tracks - kept.num_tracks
     assert num_left_out < 2 * still_in_logo(tracks)

@@ -1,4 +1,4 @@
-"""Videos whose camera stands still for a while, which encoders code in their largest blocks."""
+"""Videos whose camera stops for a while, where encoders use their largest blocks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PAUSE = range(12, 42)
 
 
 @pytest.mark.shared
-def test_tracks_go_on_through_a_pause(shared: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_tracks_continue_through_a_pause(shared: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     clip = shared / "sequences" / "ditch" / "clip.mp4"
     filters = f"loop=loop={len(PAUSE) - 1}:size=1:start={PAUSE[0]},noise=alls=3:allf=t"
     lossy = ("-frames:v", "54", "-c:v", "libx264", "-preset", "fast", "-crf", "20")

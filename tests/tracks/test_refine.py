@@ -31,7 +31,7 @@ def texture(size: int, seed: int = 0) -> NDArray[np.float32]:
 
 
 def pictures(noise: float = 1.0) -> list[tuple[int, NDArray[np.uint8]]]:
-    """A textured plane that moves by STEP a frame behind a flat strip that stays."""
+    """A textured plane that moves by STEP per frame, and a flat strip that does not move."""
     rng = np.random.default_rng(1)
     plane = texture(512)
     frames = []
@@ -45,7 +45,7 @@ def pictures(noise: float = 1.0) -> list[tuple[int, NDArray[np.uint8]]]:
 
 
 def moving_tracks(step_error: float, seed: int = 2) -> tuple[Tracks, NDArray[np.float64]]:
-    """Tracks whose steps are wrong by some px, and where they truly go."""
+    """Tracks with errors of `step_error` pixels per step, and their true positions."""
     rng = np.random.default_rng(seed)
     start = rng.uniform((30, 40), (WIDTH - 40, HEIGHT - 30), (800, 2))
     start = start[np.abs(start[:, 0] - FLAT) > 25]
@@ -73,7 +73,7 @@ def is_textured(tracks: Tracks) -> NDArray[np.bool_]:
     return np.asarray(np.repeat(first > FLAT, tracks.lengths))
 
 
-def test_errors_shrink_and_do_not_add_up() -> None:
+def test_refinement_reduces_errors_without_drift() -> None:
     tracks, truth = moving_tracks(0.3)
     refined = refine_tracks(tracks, pictures(), LK)
     textured = is_textured(tracks)
@@ -85,13 +85,13 @@ def test_errors_shrink_and_do_not_add_up() -> None:
     assert np.median(before[last]) > 1.0
     assert np.median(error[last]) < 0.06
     assert np.percentile(error[textured & refined.confirmed], 99) < 0.3
-    # Sure of it, and not surer than the errors are small.
+    # Sigma decreases, but is not smaller than the errors.
     sure = last & refined.confirmed
     assert np.median(refined.sigma[sure] / tracks.sigma[sure]) < 0.5
     assert np.sqrt(np.mean(error[sure] ** 2)) < np.sqrt(np.mean(refined.sigma[sure] ** 2))
 
 
-def test_what_pixels_cannot_confirm_keeps_the_bitstreams_steps() -> None:
+def test_tracks_without_texture_keep_their_motion() -> None:
     tracks, _ = moving_tracks(0.3)
     refined = refine_tracks(tracks, pictures(), LK)
     flat = ~is_textured(tracks)
@@ -102,9 +102,9 @@ def test_what_pixels_cannot_confirm_keeps_the_bitstreams_steps() -> None:
     assert refined.num_observations == tracks.num_observations
 
 
-def test_a_wrong_step_is_not_confirmed_and_gets_lost_for_good() -> None:
+def test_wrong_step_is_not_confirmed() -> None:
     tracks, truth = moving_tracks(0.05)
-    # From frame 5 on every third track is 8 px off.
+    # From frame 5 on, every third track is wrong by 8 px.
     off = np.repeat(np.arange(tracks.num_tracks) % 3 == 0, FRAMES) & (tracks.frame >= 5)
     tracks.xy[off] += np.float32(8)
     refined = refine_tracks(tracks, pictures(), LK)
@@ -112,12 +112,12 @@ def test_a_wrong_step_is_not_confirmed_and_gets_lost_for_good() -> None:
     at_jump = off & textured & (tracks.frame == 5)
     assert refined.confirmed[at_jump].mean() < 0.1
     error = np.linalg.norm(refined.xy - truth, axis=1)
-    # A new template is taken where it is: it may be confirmed again, its error as large as said.
+    # Tracking restarts with a new template at the wrong position, so the error stays the same.
     np.testing.assert_allclose(np.median(error[at_jump]), 8 * np.sqrt(2), atol=0.3)
     assert np.median(error[textured & ~off]) < 0.06
 
 
-def test_frames_that_are_missing_keep_the_bitstreams_steps() -> None:
+def test_tracks_in_missing_frames_keep_their_motion() -> None:
     tracks, truth = moving_tracks(0.3)
     shown = [frame for frame in pictures() if frame[0] not in (4, 5, FRAMES - 1)]
     refined = refine_tracks(tracks, shown, LK)
@@ -134,7 +134,7 @@ def test_frames_that_are_missing_keep_the_bitstreams_steps() -> None:
     assert np.median(np.linalg.norm((refined.xy - truth)[later], axis=1)) < 0.06
 
 
-def test_no_refinement_reads_no_frames() -> None:
+def test_frames_are_not_read_without_refinement() -> None:
     def frames() -> Any:
         pytest.fail("read")
         yield
@@ -178,7 +178,7 @@ def test_progress_counts_frames() -> None:
     assert seen == list(range(1, FRAMES + 1))
 
 
-def test_the_example_clip_is_refined_and_knows_its_errors() -> None:
+def test_errors_and_sigmas_on_the_example_clip() -> None:
     tracks = build_tracks(read_motion(EXAMPLE))
     refined = refine_tracks(tracks, decode_frames(EXAMPLE), LK)
     later = np.ones(tracks.num_observations, bool)
@@ -188,7 +188,7 @@ def test_the_example_clip_is_refined_and_knows_its_errors() -> None:
     np.testing.assert_array_equal(refined.offsets, tracks.offsets)
 
     scene = render_scene.build_scene()
-    # Tracks that start in every twentieth frame, four steps later.
+    # Tracks that start in every twentieth frame, compared after four steps.
     start = tracks.offsets[:-1][tracks.lengths > 4]
     start = start[(tracks.frame[start] % 20 == 0) & (tracks.frame[start + 4] % 20 == 4)]
     truth = np.full((len(start), 2), np.nan)
@@ -203,7 +203,7 @@ def test_the_example_clip_is_refined_and_knows_its_errors() -> None:
         seen = np.isfinite(errors).all(axis=1)
         assert seen.sum() > 2000
         assert np.median(np.abs(errors[seen])) < largest
-        # In every third of the expected error, surest first, it is of the right size.
+        # In each tercile of sigma, the actual error agrees with sigma.
         order = np.argsort(found.sigma[start + 4][seen])
         for part in np.array_split(order, 3):
             expected = np.sqrt(np.mean(found.sigma[start + 4][seen][part] ** 2))
@@ -211,7 +211,7 @@ def test_the_example_clip_is_refined_and_knows_its_errors() -> None:
             assert 0.5 < actual / expected < 2
 
 
-def test_few_tracks_are_corrected_in_the_images_alone() -> None:
+def test_spread_tracks_are_refined_in_the_images_only() -> None:
     tracks, truth = moving_tracks(0.15)
     frames = np.arange(0, FRAMES, 3, dtype=np.int32)
     asked = [item for item in pictures() if item[0] in frames]
@@ -224,7 +224,7 @@ def test_few_tracks_are_corrected_in_the_images_alone() -> None:
     np.testing.assert_array_equal(refined.xy[elsewhere], tracks.xy[elsewhere])
     np.testing.assert_array_equal(refined.sigma[elsewhere], tracks.sigma[elsewhere])
     textured = refined.confirmed & (tracks.frame > 0)
-    # As many as are spread over the picture, 10 pixels apart.
+    # Only tracks 10 pixels apart are refined.
     assert 300 < textured.sum() / 3 < tracks.num_tracks
     error = np.linalg.norm(refined.xy - truth.reshape(-1, 2), axis=1)[textured]
     before = np.linalg.norm(tracks.xy - truth.reshape(-1, 2), axis=1)[textured]
@@ -232,7 +232,7 @@ def test_few_tracks_are_corrected_in_the_images_alone() -> None:
     assert (refined.sigma[textured] < tracks.sigma[textured]).mean() > 0.9
 
 
-def test_tracks_that_no_image_sees_stay() -> None:
+def test_tracks_are_unchanged_with_too_few_images() -> None:
     tracks, _ = moving_tracks(0.15)
     frames = np.array([0, FRAMES - 1], dtype=np.int32)
     # Two images are too few for a selection.
@@ -240,11 +240,11 @@ def test_tracks_that_no_image_sees_stay() -> None:
     np.testing.assert_array_equal(refined.xy, tracks.xy)
 
 
-def test_texture_of_some_windows_is_that_of_the_whole_picture() -> None:
+def test_texture_of_windows_matches_that_of_the_whole_picture() -> None:
     picture = np.clip(texture(160), 0, 255).astype(np.uint8)[:120]
-    # Farther from the edges than a window and its gradients reach.
+    # Windows and their gradients do not reach the edges.
     at = np.random.default_rng(3).integers(9, (160 - 9, 120 - 9), (12, 2))
-    for some in (at, np.repeat(at, 3, axis=0)):  # the latter in the whole picture, in less time
+    for some in (at, np.repeat(at, 3, axis=0)):  # with many windows, computed for the whole picture
         for found, of_all in zip(
             texture_at(picture, some, 15), texture_of(picture, 15), strict=True
         ):

@@ -1,4 +1,4 @@
-"""Streams that show a picture again instead of coding it."""
+"""Streams that show an existing frame again instead of coding a new one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NUM_FRAMES = 20
 
 @pytest.fixture(scope="module")
 def videos(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """A clip, and the same where pictures are shown again at once, later, and at the end."""
+    """A clip, and the same clip with frames shown again at once, later, and at the end."""
     folder = tmp_path_factory.mktemp("repeats")
     clip = encode(make_frames(NUM_FRAMES), folder / "clip.mp4")
     repeats = [(11, 5, 3), (12, 5, 2), (NUM_FRAMES - 1, 5, 4)]
@@ -45,7 +45,7 @@ def observations(tracks: Tracks, frame: int) -> list[list[float]]:
     return sorted(tracks.xy[tracks.frame == frame].tolist())
 
 
-def test_pictures_shown_again_are_seen_as_before(videos: list[Path]) -> None:
+def test_repeated_frames_have_the_observations_of_the_first(videos: list[Path]) -> None:
     _, again = videos
     first = first_showings(again, ReadOptions())
     pictures = [picture for _, picture in decode_frames(again)]
@@ -73,7 +73,7 @@ def test_pictures_shown_again_are_seen_as_before(videos: list[Path]) -> None:
     assert set(chosen.frame.tolist()) == set(wanted.tolist())
 
 
-def test_images_shown_again_leave_no_gap(videos: list[Path], tmp_path: Path) -> None:
+def test_repeated_frames_cause_no_gap(videos: list[Path], tmp_path: Path) -> None:
     report = match(tmp_path / "a.db", videos[1])
     assert report.num_images == NUM_FRAMES + 9
     assert report.links.gaps == ()

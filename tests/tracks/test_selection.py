@@ -14,7 +14,7 @@ ANY = {"max_tracks_per_image": 0, "spacing": 0.0, "min_images": 1, "max_sigma": 
 
 
 def random_tracks(num_tracks: int = 3000, seed: int = 0) -> Tracks:
-    """Tracks that stay within a pixel of where they start, surest in the left half."""
+    """Tracks that stay within a pixel of their start, with smaller errors in the left half."""
     rng = np.random.default_rng(seed)
     first = rng.integers(0, FRAMES - 3, num_tracks)
     length = np.minimum(rng.integers(3, 20, num_tracks), FRAMES - first)
@@ -54,7 +54,7 @@ def test_presets_are_ordered() -> None:
     assert 0 < sizes[0] < sizes[1] < sizes[2]
 
 
-def test_no_image_holds_more_than_its_share() -> None:
+def test_max_tracks_per_image_is_respected() -> None:
     tracks = random_tracks()
     chosen = select_tracks(tracks, DensityOptions(**ANY | {"max_tracks_per_image": 100}))
     counts = per_image(chosen)
@@ -77,7 +77,7 @@ def test_spacing_spreads_tracks_over_the_image() -> None:
     assert found.shape[1] > 0.8 * cells(tracks)[0].shape[1]
 
 
-def test_sure_and_long_tracks_come_first() -> None:
+def test_accurate_and_long_tracks_are_preferred() -> None:
     tracks = random_tracks()
     options = DensityOptions(**ANY | {"max_tracks_per_image": 60, "min_images": 3})
     chosen = select_tracks(tracks, options)
@@ -85,19 +85,19 @@ def test_sure_and_long_tracks_come_first() -> None:
     assert chosen.lengths.mean() > 1.15 * tracks.lengths.mean()
 
 
-def test_max_sigma_and_min_images_hold_for_what_is_left() -> None:
+def test_max_sigma_and_min_images_are_respected() -> None:
     tracks = random_tracks()
     chosen = select_tracks(tracks, DensityOptions(**ANY | {"max_sigma": 0.5, "min_images": 5}))
     assert chosen.sigma.max() <= 0.5
     assert chosen.lengths.min() >= 5
-    # What is left out is too unsure or too short.
+    # Nothing else is dropped.
     expected = tracks.keep_observations(tracks.sigma <= 0.5)
     assert chosen.num_tracks == (expected.lengths >= 5).sum()
 
 
-def test_presets_follow_the_distance_of_images() -> None:
+def test_presets_adapt_to_the_spacing_of_images() -> None:
     tracks = random_tracks()
-    # Every fourth frame is an image, and errors are as large as those of four steps.
+    # Every fourth frame is an image, so errors grow by four steps from image to image.
     spaced = tracks.keep_observations(tracks.frame % 4 == 0)
     chosen = select_tracks(spaced, DensityOptions())
     largest = chosen.sigma.max()
@@ -107,31 +107,31 @@ def test_presets_follow_the_distance_of_images() -> None:
     reach = np.sqrt(np.maximum(sigma**2 - first**2, 0))
     given = select_tracks(spaced, DensityOptions(max_sigma=0.5, min_images=1))
     assert len(given.frame) <= (reach <= 0.5).sum()
-    # The first observation that is left is what the others are held against.
+    # Errors are relative to the first remaining observation.
     late = tracks.keep_observations(tracks.sigma >= 0.3)
     assert len(select_tracks(late, DensityOptions(**ANY | {"max_sigma": 0.2})).frame) > 0
 
 
 def moving(tracks: Tracks, pixels: float) -> Tracks:
-    """The tracks with every second one moving so far from each frame to the next."""
+    """The tracks, with every second one moving by this many pixels per frame."""
     track = tracks.track
     step = np.arange(len(track)) - tracks.offsets[:-1][track]
     way = np.float32([pixels, 0]) * (step * (track % 2 == 0))[:, None].astype(np.float32)
     return replace(tracks, xy=tracks.xy + way)
 
 
-def test_errors_are_held_against_the_way() -> None:
+def test_max_sigma_does_not_apply_to_tracks_that_move_far() -> None:
     tracks = random_tracks()
     options = DensityOptions(**ANY | {"max_sigma": 0.5, "wide_tracks": 10**6})
     near = select_tracks(tracks, options)
-    # By far more than thirty times their error.
+    # The motion is far more than thirty times the error.
     quick = select_tracks(moving(tracks, 40), options)
     moves = tracks.track % 2 == 0
     assert near.num_observations < 0.9 * tracks.num_observations
     assert len(quick.frame) == moves.sum() + ((tracks.sigma <= 0.5) & ~moves).sum()
 
 
-def test_images_keep_the_surest_of_their_widest_tracks() -> None:
+def test_images_keep_their_widest_tracks() -> None:
     tracks = moving(random_tracks(4000), 40)
     sizes: list[int] = []
     for wide_tracks in (0, 20, 60):
@@ -143,7 +143,7 @@ def test_images_keep_the_surest_of_their_widest_tracks() -> None:
         for frame in range(12, FRAMES):
             own = chosen.frame == frame
             farthest = np.sort(way[own])[-wide_tracks:].min() if wide_tracks else np.inf
-            # So many, and some more that are as sure and moved less far.
+            # At least this many, and some more with the same error and less motion.
             assert np.count_nonzero(own & (way >= 0.8 * farthest)) >= wide_tracks
             assert (wide_tracks > 0) == np.any(own & unsure)
             if wide_tracks:
@@ -153,7 +153,7 @@ def test_images_keep_the_surest_of_their_widest_tracks() -> None:
     assert sizes[-1] < 0.9 * tracks.num_observations
 
 
-def test_kept_observations_stay_with_their_tracks() -> None:
+def test_keep_observations_preserves_tracks() -> None:
     tracks = random_tracks(50)
     kept = np.random.default_rng(1).random(tracks.num_observations) < 0.3
     kept[tracks.offsets[3] : tracks.offsets[4]] = False
@@ -168,7 +168,7 @@ def test_kept_observations_stay_with_their_tracks() -> None:
         np.testing.assert_array_equal(subset.xy[subset.offsets[i] : subset.offsets[i + 1]], xy)
 
 
-def test_no_tracks_are_no_error() -> None:
+def test_selection_of_no_tracks_is_empty() -> None:
     tracks = random_tracks()
     none = tracks.keep_observations(np.zeros(tracks.num_observations, bool))
     assert len(none.offsets) == 1
@@ -176,7 +176,7 @@ def test_no_tracks_are_no_error() -> None:
         assert len(select_tracks(none, DensityOptions(preset=preset)).frame) == 0
 
 
-def test_selection_is_repeatable() -> None:
+def test_selection_is_deterministic() -> None:
     tracks = random_tracks()
     options = DensityOptions(preset="sparse")
     first, again = select_tracks(tracks, options), select_tracks(replace(tracks), options)

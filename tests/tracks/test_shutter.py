@@ -1,4 +1,4 @@
-"""Rolling shutters of known read-out time: estimated from tracks, and corrected."""
+"""Rolling shutter: the read-out time is estimated from tracks, and tracks are corrected."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ POINTS = np.random.default_rng(0).uniform([-9, -5, 8], [9, 5, 18], (900, 3))
 
 
 def seen_at(frame: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels [n, 2] where points [n] are seen at times [n] in frames, by an unsteady hand."""
+    """Projections [n, 2] of the points at times [n] in frames, from a hand-held camera."""
     t = np.broadcast_to(frame, len(POINTS)) / RATE
     centre = np.column_stack([1.5 * t, 0.1 * np.sin(7 * t), 0.1 * np.sin(5 * t)])
     turn = np.column_stack(
@@ -47,12 +47,12 @@ def seen_at(frame: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tracks_of(read_out: float, noise: float = 0.1, across: bool = False) -> Tracks:
-    """Tracks of a shutter that reads in so many frames, from the left where not from the top."""
+    """Tracks with a read-out time in frames, by columns from the left if `across`, else by rows."""
     axis, length = (0, WIDTH) if across else (1, HEIGHT)
     xy = np.empty((len(POINTS), NUM_FRAMES, 2))
     for frame in range(NUM_FRAMES):
         at = np.full(len(POINTS), float(frame))
-        for _ in range(4):  # when the row is read that shows the point
+        for _ in range(4):  # the time at which the row that shows the point is read
             at = frame + read_out * (seen_at(at)[:, axis] / length - 0.5)
         xy[:, frame] = seen_at(at)
     xy += np.random.default_rng(1).normal(0, noise, xy.shape)
@@ -71,13 +71,13 @@ def tracks_of(read_out: float, noise: float = 0.1, across: bool = False) -> Trac
 
 
 @pytest.mark.parametrize(("read_out", "focal"), [(0.15, FOCAL), (-0.8, FOCAL), (0.45, None)])
-def test_read_out_is_estimated(read_out: float, focal: float | None) -> None:
+def test_read_out_time_is_estimated(read_out: float, focal: float | None) -> None:
     found = estimate_read_out(tracks_of(read_out), (0, 1), focal)
     assert isinstance(found, ReadOut)
     assert found.frames == pytest.approx(read_out, rel=0.1, abs=0.01)
 
 
-def test_pictures_taken_at_once_stay() -> None:
+def test_no_read_out_time_is_found_without_a_rolling_shutter() -> None:
     tracks = tracks_of(0.0)
     assert isinstance(estimate_read_out(tracks, (0, 1), FOCAL), str)
     still = replace(tracks, xy=np.repeat(tracks.xy[::NUM_FRAMES], NUM_FRAMES, axis=0))
@@ -88,7 +88,7 @@ def test_pictures_taken_at_once_stay() -> None:
 
 
 @pytest.mark.parametrize("across", [False, True])
-def test_tracks_are_moved_to_the_middle_of_the_read_out(across: bool) -> None:
+def test_tracks_are_corrected_to_the_middle_of_the_read_out(across: bool) -> None:
     seen, exact = tracks_of(0.5, 0.0, across), tracks_of(0.0, 0.0)
     assert len(seen.xy) == len(exact.xy)
     corrected = correct_tracks(seen, 0.5, (1, 0) if across else (0, 1))
@@ -97,7 +97,7 @@ def test_tracks_are_moved_to_the_middle_of_the_read_out(across: bool) -> None:
     assert np.sqrt(np.mean(after**2)) < 0.15 * np.sqrt(np.mean(before**2))
 
 
-def test_velocities_of_what_starts_ends_or_is_alone() -> None:
+def test_velocities_at_the_ends_of_tracks() -> None:
     frame = np.array([3, 0, 1, 2, 3, 4, 5, 7, 8], np.int32)
     offsets = np.array([0, 1, 7, 9])
     x = np.concatenate([[5], 100 * np.arange(6) ** 2 / 25 + 40, [600, 606]])
@@ -111,19 +111,32 @@ def test_velocities_of_what_starts_ends_or_is_alone() -> None:
         sigma=np.zeros(9, np.float32),
         confirmed=np.zeros(9, np.bool_),
     )
-    exact = [0, 4, 8, 16, 24, 32, 36, 6, 6]  # 8 t, and the step where there is one alone
+    exact = [
+        0,
+        4,
+        8,
+        16,
+        24,
+        32,
+        36,
+        6,
+        6,
+    ]  # 8 t inside the track, one-sided differences at its ends
     np.testing.assert_allclose(velocities(tracks)[:, 0], exact, atol=1e-3)
     np.testing.assert_allclose(velocities(tracks)[:, 1], 0, atol=1e-3)
 
 
-def test_rows_are_those_of_the_sensor() -> None:
+def test_rows_follow_the_orientation_of_the_sensor() -> None:
     assert rows_down(Display(), (640, 480)) == (0, 1)
-    assert rows_down(Display(), (480, 640)) == (1, 0)  # turned by a program, who knows which way
+    assert rows_down(Display(), (480, 640)) == (
+        1,
+        0,
+    )  # rotated by a program in an unknown direction
     assert rows_down(Display(turn=((0, -1), (1, 0))), (480, 640)) == (-1, 0)
     assert rows_down(Display(turn=((-1, 0), (0, -1))), (640, 480)) == (0, -1)
 
 
-def test_what_is_asked_for() -> None:
+def test_rolling_shutter_option() -> None:
     tracks = tracks_of(0.45)
     for wanted, found in (("none", None), ("15", 15.0), ("-7.5", -7.5)):
         options = MatchOptions(camera=CameraOptions(rolling_shutter=wanted))
@@ -150,7 +163,9 @@ def test_what_is_asked_for() -> None:
             CameraOptions(rolling_shutter=wrong)
 
 
-def test_command(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_match_command_reports_the_rolling_shutter(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ["--video", str(clip), "--rolling_shutter=12.5"]
     assert main(["match", "--database", str(tmp_path / "a.db"), *words]) == 0
     printed = capsys.readouterr().out
@@ -159,7 +174,7 @@ def test_command(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert report.read_outs == (None,)
 
 
-def test_info_tells_the_read_out_time(
+def test_info_command_reports_the_read_out_time(
     clip: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["info", "--video", str(clip), "--quiet"]
@@ -179,7 +194,7 @@ def test_info_tells_the_read_out_time(
     monkeypatch.setattr(of_video, "track_video", track)
     found = of_video.estimate_video_read_out(clip)
     assert not isinstance(found, str)
-    # The clip has 25 frames a second.
+    # The clip has 25 frames per second.
     assert found.milliseconds == pytest.approx(0.45 * 40, rel=0.1)
     assert abs(found.milliseconds - 0.45 * 40) < found.error < 4
     assert main(words) == 0
@@ -187,7 +202,7 @@ def test_info_tells_the_read_out_time(
     assert row.startswith(f"rolling shutter\t{found.milliseconds:.1f} +- {found.error:.1f} ms")
 
 
-def test_poses_are_the_same_where_no_read_out_is_found(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_poses_are_unchanged_if_no_read_out_time_is_found(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     scene = Path(__file__).resolve().parents[2] / "examples" / "scene.mp4"
     video = ffmpeg("-i", scene, "-frames:v", "8", "-c", "copy", tmp_path / "short.mp4")
     found = []

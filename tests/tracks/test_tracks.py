@@ -26,7 +26,7 @@ NEWMV, GLOBALMV = 16, 15
 LOCALWARP = 2
 LAST, GOLDEN, ALTREF = 1, 4, 7
 ONE = 1 << 16
-# No rule of trust: every displacement counts.
+# No filter: every displacement is used.
 OPEN = TrackOptions(
     cosine=None,
     max_interval=None,
@@ -37,10 +37,10 @@ OPEN = TrackOptions(
     interpolation=None,
     bridge=None,
 )
-# The rules of trust that do not depend on how large the picture is.
+# The filters that do not depend on the size of the picture.
 SMALL_PICTURES = TrackOptions(border=None)
 
-# A list's motion: (dx, dy) in px for all units, or an int16 array [rows, cols, 2] (row, col).
+# Motion of a list: (dx, dy) in px for all units, or an int16 array [rows, cols, 2] (row, col).
 Motion = tuple[float, float] | NDArray[np.int16]
 
 
@@ -108,7 +108,7 @@ def frame(
 
 
 def low_delay(motions: Sequence[Motion], **keywords: Any) -> list[FrameMotion]:
-    """A key frame, then one frame for each motion into the frame before."""
+    """A key frame, then a frame for each motion, which refers to the preceding frame."""
     frames = [frame(0, **keywords)]
     for i, vector in enumerate(motions, start=1):
         frames.append(frame(i, refs={LAST: (i - 1, i - 1)}, motion=[(LAST, vector)], **keywords))
@@ -154,7 +154,7 @@ def warp_units(motion: FrameMotion, params: Sequence[int]) -> FrameMotion:
 def similarity_params(angle: float, zoom: float, shift: tuple[float, float]) -> list[int]:
     """Warp parameters of p -> zoom R p + shift in corner-origin coordinates."""
     c, s = zoom * math.cos(angle), zoom * math.sin(angle)
-    # In coordinates that are zero at the first pixel's centre.
+    # In coordinates with the origin at the centre of the first pixel.
     tx = shift[0] + 0.5 * (c - s) - 0.5
     ty = shift[1] + 0.5 * (s + c) - 0.5
     return [round(v * ONE) for v in (tx, ty, c, -s, s, c)]
@@ -229,7 +229,7 @@ def test_displacement_refuses_indices_outside_its_tables() -> None:
             displacement(replace(motion, block_index=outside))
 
 
-def test_arrays_of_any_memory_layout_are_read_and_of_another_kind_refused() -> None:
+def test_arrays_may_have_any_memory_layout_but_not_another_type() -> None:
     motion = global_warp(BLOCK_8X8)
     laid_out = replace(
         motion,
@@ -268,7 +268,7 @@ def test_constant_translation_adds_up_exactly(step: tuple[float, float]) -> None
         np.testing.assert_array_equal(
             np.diff(xy, axis=0), np.full((len(xy) - 1, 2), -np.float32(step))
         )
-    # All start at unit centres, and of the first frame's none is lost but over the edge.
+    # All start at unit centres, and tracks of the first frame are lost only at the edge.
     starts = tracks.xy[tracks.offsets[:-1]]
     np.testing.assert_array_equal(starts % 4, 2)
     third = np.mgrid[2:64:4, 2:48:4].reshape(2, -1).T - 3 * np.array(step)
@@ -305,7 +305,7 @@ def test_rotation_and_zoom_stay_near_the_true_path(angle: float, zoom: float) ->
         for _ in range(len(xy) - 1):
             truth = np.array(back(*truth))
         errors.append(np.hypot(*(truth - xy[0])) / (len(xy) - 1))
-    # A step's error: vectors to 1/8 px, and motion held over a unit (2 px x gradient).
+    # Error per step: vectors are rounded to 1/8 px, and motion is constant within a unit.
     assert np.max(errors) < 0.15
     assert np.mean(errors) < 0.06
 
@@ -350,7 +350,7 @@ def test_random_access_follows_short_steps_in_both_directions(far: tuple[float, 
     step = (1.25, -0.5)
     tracks = build_tracks(hierarchy(step, far), SMALL_PICTURES)
     check_invariants(tracks, 4)
-    # What leaves the picture is left to the far vector.
+    # Tracks that leave the picture use the far vector.
     ends = [(xy, xy[0] - 4 * np.float32(step)) for shown, xy in split(tracks) if len(shown) == 5]
     full = [xy for xy, end in ends if ((end >= 0) & (end < (64, 48))).all()]
     assert len(full) >= 14 * 10
@@ -358,8 +358,8 @@ def test_random_access_follows_short_steps_in_both_directions(far: tuple[float, 
         np.testing.assert_array_equal(np.diff(xy, axis=0), np.tile(-np.float32(step), (4, 1)))
 
 
-def test_a_frame_coded_ahead_ends_the_video() -> None:
-    # The last frames are shown by headers alone, which yield no motion.
+def test_video_may_end_with_a_frame_coded_ahead() -> None:
+    # The last frames are only shown by frame headers, which have no motion.
     tracks = build_tracks(
         hierarchy((0.0, 0.0), (0.0, 0.0))[:3], TrackOptions(min_length=3, border=None)
     )
@@ -389,13 +389,13 @@ def test_steps_longer_than_the_limit_are_not_taken() -> None:
 
 @pytest.mark.parametrize("uncoded", [0, 1])
 @pytest.mark.parametrize("step", [(0.0, 0.0), (0.75, -0.25)])
-def test_largest_blocks_are_trusted_where_the_whole_frame_moves_evenly(
+def test_largest_blocks_are_tracked_if_the_whole_frame_moves_alike(
     step: tuple[float, float], uncoded: int
 ) -> None:
     def count(elsewhere: int, detail: int = 4) -> int:
-        """Tracks through five frames of 48 rows of units.
+        """Number of tracks through five frames of 48 rows of units.
 
-        So many of the last rows move otherwise, and so many of the first are of small blocks.
+        The last `elsewhere` rows move differently, and the first `detail` rows have small blocks.
         """
         motion = np.zeros((48, 64, 2), np.int16)
         motion[...] = round(8 * step[1]), round(8 * step[0])
@@ -408,11 +408,11 @@ def test_largest_blocks_are_trusted_where_the_whole_frame_moves_evenly(
 
     assert count(0) >= count(4) > 0.8 * 44 * 64
     assert count(6) <= 4 * 64
-    # As pictures of one colour do.
+    # As in pictures of a single colour.
     assert count(0, detail=0) == 0
 
 
-def test_hidden_frames_carry_tracks_and_are_not_observed() -> None:
+def test_hidden_frames_continue_tracks_without_observations() -> None:
     step = (0.5, 0.25)
     frames = [
         frame(0, 0),
@@ -432,8 +432,8 @@ def test_hidden_frames_carry_tracks_and_are_not_observed() -> None:
         np.testing.assert_array_equal(xy[0] - xy, np.outer([0, 2, 4, 5], step))
 
 
-def test_the_second_list_is_used_where_the_first_finds_no_track() -> None:
-    # The nearer reference is no longer in a slot that was ever coded here.
+def test_second_list_is_used_if_the_first_finds_no_track() -> None:
+    # The nearer reference is in a slot that was never coded here.
     frames = low_delay([(1.0, 0.0)] * 3)
     frames.append(
         frame(
@@ -469,7 +469,7 @@ def test_intra_blocks_end_tracks_and_seed_new_ones() -> None:
 
 
 @pytest.mark.parametrize(("jump", "goes_on"), [(0.0, True), (1.5, True), (3.0, False)])
-def test_tracks_cross_intra_blocks_where_both_sides_move_alike(jump: float, goes_on: bool) -> None:
+def test_tracks_cross_intra_blocks_if_both_sides_move_alike(jump: float, goes_on: bool) -> None:
     mv = np.zeros((12, 16, 2), np.int16)
     mv[:, 7:, 1] = round(8 * jump)
     frames = low_delay([(0.0, 0.0)] * 3 + [mv] + [(0.0, 0.0)] * 4)
@@ -482,21 +482,21 @@ def test_tracks_cross_intra_blocks_where_both_sides_move_alike(jump: float, goes
     assert (len(whole) == 4 * 12) == goes_on
     assert (len(whole) == 0) == (not goes_on)
     for xy in whole:
-        # From the left side's motion to that of the right side, by the distance to both.
+        # Motion is interpolated between the left and the right side by distance.
         share = ((xy[0, 0] - 2) / 4 - 2) / 5
         np.testing.assert_allclose(xy[3, 0] - xy[4, 0], share * jump, atol=1e-5)
         np.testing.assert_array_equal(xy[:, 1], xy[0, 1])
-    # They are less sure than those beside that have motion of their own.
+    # They have a larger sigma than neighbours with motion of their own.
     if jump and goes_on:
         bridged = tracks.sigma[tracks.frame == 4].reshape(12, 16)
         assert (bridged[:, 3:7] > bridged[:, :3].max()).all()
 
 
-def test_tracks_in_the_gap_between_blocks_go_on() -> None:
-    # The tracks of columns 0 to 8 come to lie half a pixel from the left edges of their units.
+def test_tracks_between_diverging_blocks_continue() -> None:
+    # Tracks of columns 0 to 8 move to half a pixel from the left edges of their units.
     shift = np.zeros((12, 16, 2), np.int16)
     shift[:, :9, 1] = round(8 * 1.5)
-    # Then the right half comes from a pixel further right, and no vector leads to x = 32.5.
+    # Then the right half refers to a pixel further right, and no vector points to x = 32.5.
     apart = np.zeros((12, 16, 2), np.int16)
     apart[:, 8:, 1] = 8
     frames = low_delay([shift, apart])
@@ -515,11 +515,9 @@ def test_tracks_in_the_gap_between_blocks_go_on() -> None:
     ("cell", "going_on"),
     [(4, [[6.0, 5.5, 5.5, 3.5]]), (2, [[6.0, 5.5, 5.5, 3.5], [2.0, 3.5, 1.5]])],
 )
-def test_of_two_tracks_in_one_cell_the_longer_goes_on(
-    cell: int, going_on: list[list[float]]
-) -> None:
-    # Column 0 seeds tracks in frame 1 that come to x = 3.5; those of column 1 are from frame 0 and
-    # lie at 5.5. In frame 3 one unit finds both, the young one nearer to its centre.
+def test_longer_of_two_tracks_in_a_cell_continues(cell: int, going_on: list[list[float]]) -> None:
+    # Column 0 seeds tracks in frame 1 that move to x = 3.5; those of column 1 start in frame 0 and
+    # are at 5.5. In frame 3 one unit refers to both; the younger one is nearer to its centre.
     steps = np.zeros((3, 12, 16, 2), np.int16)
     steps[0, :, 1, 1] = round(8 * 0.5)
     steps[1, :, 0, 1] = round(8 * -1.5)
@@ -534,7 +532,7 @@ def test_of_two_tracks_in_one_cell_the_longer_goes_on(
     assert sorted(paths) == sorted(going_on * 12)
 
 
-def test_squares_are_not_larger_than_those_of_seeding() -> None:
+def test_cell_is_at_most_the_seeding_distance() -> None:
     frames = low_delay([(0.25, 0.5)] * 4)
     fine = build_tracks(frames, replace(OPEN, seeding=2))
     assert fine.xy.tobytes() == build_tracks(frames, replace(OPEN, seeding=2, cell=2)).xy.tobytes()
@@ -553,17 +551,17 @@ def test_a_track_starts_in_every_empty_square(cell: int, seeding: int) -> None:
     at_once = tracks.frame[tracks.offsets[:-1]] == 0
     assert at_once.sum() == 64 * 48 // seeding**2
     assert (first % seeding == seeding / 2).all()
-    # What moves to the left and up leaves squares at the right and below.
+    # Motion to the left and up uncovers squares at the right and below.
     assert (first[~at_once] >= np.array([64, 48]) - 3 * seeding).any(axis=1).all()
     for shown, xy in split(tracks):
         assert np.array_equal(xy, xy[0] - np.outer(shown - shown[0], steps[0]))
-    # Of a frame that nothing moves into every square has a track of its own.
+    # In every frame, nearly every square has a track.
     assert np.bincount(tracks.frame).min() >= 60 * 46 // seeding**2
 
 
-def test_one_track_goes_to_one_unit_the_best_one() -> None:
-    # Both columns of units look at column 0 of the reference; the second by way of a
-    # vector that lands 1 px off its centre.
+def test_track_continues_in_the_best_matching_unit_only() -> None:
+    # Both columns of units refer to column 0 of the reference; the vector of the second one
+    # points 1 px away from its centre.
     mv = np.zeros((12, 16, 2), np.int16)
     mv[:, 1, 1] = 8 * -5
     frames = low_delay([(0.0, 0.0), mv, (0.0, 0.0), (0.0, 0.0)])
@@ -603,7 +601,7 @@ def test_a_reference_of_another_size_is_scaled() -> None:
 
 
 def test_super_resolution_positions_are_in_the_upscaled_picture() -> None:
-    # FrameWidth 32, UpscaledWidth 64: a coded pixel is two wide.
+    # FrameWidth 32, UpscaledWidth 64: a coded pixel is two pixels wide.
     def half(motion: FrameMotion) -> FrameMotion:
         return replace(motion, width=64, header=motion.header | {"frame_width": 32})
 
@@ -655,8 +653,8 @@ def test_long_tracks_are_kept() -> None:
 # trust
 
 
-def test_large_and_uncoded_blocks_are_not_followed() -> None:
-    # There and back, every second row against the others: no motion of the picture as a whole.
+def test_large_and_uncoded_blocks_are_not_tracked() -> None:
+    # Every second row moves against the others, so there is no common motion.
     there = np.zeros((12, 16, 2), np.int16)
     there[::2], there[1::2] = (0, 4), (0, -4)
     frames = low_delay([there, -there] * 2, mi_size=BLOCK_16X16)
@@ -681,7 +679,7 @@ def test_large_and_uncoded_blocks_are_not_followed() -> None:
     assert not coded[:4, 8:].any()
 
 
-def test_smoothness_takes_out_the_block_that_disagrees() -> None:
+def test_smoothness_rejects_a_block_that_disagrees() -> None:
     frames = low_delay([(0.0, 0.0)] * 4, mi_size=BLOCK_8X8)
     for f in frames[1:]:
         units(f)["mv"][4:6, 6:8, 0, :] = 24
@@ -693,7 +691,7 @@ def test_smoothness_takes_out_the_block_that_disagrees() -> None:
     assert seen.sum() == 12 * 16 - 4
 
 
-def test_motion_at_the_edge_is_not_followed() -> None:
+def test_motion_at_the_edge_is_not_tracked() -> None:
     frames = low_delay([(0.0, 0.0)] * 5)
     tracks = build_tracks(frames, replace(OPEN, border=8.0))
     assert tracks.xy.min() >= 8
@@ -702,7 +700,7 @@ def test_motion_at_the_edge_is_not_followed() -> None:
 
 
 def block_field(slope: float, jump: float = 0.0) -> list[FrameMotion]:
-    """A field of 16x16 blocks whose one vector is the linear field's at their centres."""
+    """16x16 blocks whose vectors are those of a linear field at their centres."""
     x = np.tile(np.arange(2, 160, 4), (32, 1))
     dx = slope * (x // 16 * 16 + 8) + np.where(x >= 80, jump, 0.0)
     field = np.stack([np.zeros_like(dx), np.rint(8 * dx)], axis=-1).astype(np.int16)
@@ -710,7 +708,7 @@ def block_field(slope: float, jump: float = 0.0) -> list[FrameMotion]:
 
 
 def first_steps(tracks: Tracks) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where the motion of the second frame is from, and the displacement there."""
+    """Positions at the start of the motion of the second frame, and the displacements there."""
     start = tracks.offsets[:-1][tracks.frame[tracks.offsets[:-1]] == 0]
     step = tracks.xy[start] - tracks.xy[start + 1]
     return tracks.xy[start + 1, 0].astype(float), step[:, 0].astype(float)
@@ -728,11 +726,11 @@ def test_interpolation_lets_motion_vary_within_a_block() -> None:
 
     assert np.max(errors(1.5)) < 0.15
     assert np.max(errors(None)) > 0.4
-    # Blocks that differ by a pixel do not move alike.
+    # Blocks whose motion differs by a pixel are not interpolated.
     np.testing.assert_array_equal(errors(0.5), errors(None))
 
 
-def test_interpolation_keeps_edges_of_motion() -> None:
+def test_interpolation_preserves_motion_edges() -> None:
     x, dx = first_steps(build_tracks(block_field(1 / 32, 4.0), replace(OPEN, interpolation=1.5)))
     left = (x > 8) & (x < 70)
     right = (x > 90) & (x < 150)
@@ -740,7 +738,7 @@ def test_interpolation_keeps_edges_of_motion() -> None:
         np.testing.assert_allclose(dx[side], x[side] / 32 + jump, atol=0.3)
 
 
-def test_expected_errors_follow_the_bitstream() -> None:
+def test_sigma_depends_on_the_bitstream() -> None:
     def last_sigma(**changes: Any) -> float:
         frames = low_delay([(1.0, 0.5)] * 4, width=160, height=128, mi_size=BLOCK_16X16)
         tracks = build_tracks([with_units(f, **changes) for f in frames], OPEN)
@@ -750,7 +748,7 @@ def test_expected_errors_follow_the_bitstream() -> None:
     assert last_sigma(skip=1) > plain
     assert last_sigma(y_mode=GLOBALMV) > plain
     assert last_sigma(mi_size=BLOCK_8X8) < plain < last_sigma(mi_size=BLOCK_32X32)
-    # Blocks in disorder are less sure than those that move as one.
+    # Blocks with incoherent motion have a larger sigma than blocks that move alike.
     rng = np.random.default_rng(0)
     rough = rng.integers(-16, 17, (8, 10, 2)).repeat(4, axis=0).repeat(4, axis=1)
     frames = low_delay([rough.astype(np.int16)] * 4, width=160, height=128, mi_size=BLOCK_16X16)
@@ -764,7 +762,7 @@ def test_expected_errors_follow_the_bitstream() -> None:
 
 
 def shaking(seed: int = 0, frames: int = 20) -> list[FrameMotion]:
-    """A camera that moves steadily and shakes by several pixels each frame."""
+    """A camera that moves steadily and shakes by several pixels per frame."""
     rng = np.random.default_rng(seed)
     shake = np.rint(8 * rng.normal(0, 4, (frames, 2))) / 8
     return low_delay([tuple(s) for s in shake], width=160, height=120)
@@ -781,11 +779,11 @@ def test_cosine_relative_to_the_dominant_motion_survives_shaking() -> None:
     assert count("none") == 0
 
 
-def test_cosine_ends_a_track_that_leaves_the_motion_around_it() -> None:
+def test_cosine_ends_a_track_that_moves_against_its_surroundings() -> None:
     frames = shaking()
     corner = (slice(8, 16), slice(8, 16))
     for i, f in enumerate(frames[1:]):
-        # Back and forth against the rest, by 3 px.
+        # Moves back and forth by 3 px relative to the rest.
         units(f)["mv"][(*corner, 0)] += np.array([0, 24 if i % 2 else -24], np.int16)
     strict = build_tracks(frames, replace(OPEN, cosine=0.9))
     free = build_tracks(frames, OPEN)
@@ -922,7 +920,7 @@ def test_any_motion_gives_valid_tracks(motion: list[FrameMotion], options: Track
 
 @given(motion=random_video(), options=any_options, every=st.integers(1, 4))
 @settings(max_examples=100, deadline=None)
-def test_observations_of_some_frames_are_those_of_the_same_tracks(
+def test_observations_in_selected_frames_are_a_subset(
     motion: list[FrameMotion], options: TrackOptions, every: int
 ) -> None:
     if all(f.display_index < 0 for f in motion):
@@ -936,7 +934,7 @@ def test_observations_of_some_frames_are_those_of_the_same_tracks(
         assert getattr(some, name).tobytes() == getattr(seen, name).tobytes()
 
 
-def test_frames_alone_are_counted_through() -> None:
+def test_kept_frames_are_renumbered() -> None:
     tracks = build_tracks(low_delay([(1.0, 0.0)] * 8), OPEN)
     alone = tracks.subsample_frames(np.array([1, 4, 7], dtype=np.int32))
     assert alone.num_frames == 3
@@ -962,7 +960,7 @@ def test_no_shown_frame_is_an_error() -> None:
     most=st.integers(1, 12),
 )
 @settings(deadline=None)
-def test_tracks_split_to_a_length_hold_all_observations(lengths: list[int], most: int) -> None:
+def test_splitting_tracks_keeps_all_observations(lengths: list[int], most: int) -> None:
     total = sum(lengths)
     whole = replace(
         Tracks.empty(40, (64, 64)),

@@ -32,7 +32,7 @@ STRICT = MatchOptions(read=ReadOptions(strict=True))
 
 
 def opened(video: Path, options: MatchOptions = OPTIONS) -> VideoSource:
-    """A video that is not converted: its stream outlasts the source."""
+    """Open a video that is not converted, so that its stream remains after closing."""
     next_to = video.with_name("a.db")
     with open_source(
         read_video(video), options.source, next_to=next_to, context=RunContext()
@@ -51,7 +51,7 @@ def phone(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return encode(make_frames(6, 96, 64), folder / "phone.mp4", "-c:v", "libx264")
 
 
-def test_a_stream_that_is_not_kept_lasts_as_long_as_it_is_read(phone: Path, tmp_path: Path) -> None:
+def test_temporary_stream_is_removed_after_reading(phone: Path, tmp_path: Path) -> None:
     next_to, context = tmp_path / "a.db", RunContext()
     with open_source(read_video(phone), OPTIONS.source, next_to=next_to, context=context) as source:
         assert source.pictures.path == phone
@@ -70,7 +70,7 @@ def test_a_stream_that_is_not_kept_lasts_as_long_as_it_is_read(phone: Path, tmp_
     assert not list(tmp_path.iterdir())
 
 
-def test_a_stream_that_is_kept_stays(phone: Path, tmp_path: Path) -> None:
+def test_kept_stream_is_reused(phone: Path, tmp_path: Path) -> None:
     options = with_stream_kept(OPTIONS, tmp_path)
     assert with_stream_kept(options, tmp_path / "other") is options
     source = opened(phone, options)
@@ -81,7 +81,7 @@ def test_a_stream_that_is_kept_stays(phone: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_takes_no_stream(phone: Path, tmp_path: Path) -> None:
+def test_unwritable_folder_suggests_keep_stream(phone: Path, tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with (
         pytest.raises(EncodeError, match="--keep_stream"),
@@ -97,11 +97,11 @@ def test_a_folder_that_takes_no_stream(phone: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def trimmed(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> Path:
-    """The clip without its first five frames: they are coded, and no player shows them."""
+    """The clip trimmed by an edit list: the first five frames are coded but not shown."""
     return ffmpeg("-ss", "0.2", "-i", clip, "-c", "copy", tmp_path / "trimmed.mp4")
 
 
-def test_an_av1_video_is_its_own_stream(clip: Path) -> None:
+def test_av1_video_is_not_converted(clip: Path) -> None:
     source = opened(clip)
     assert source.stream is source.pictures
     assert source.stream.path == clip
@@ -109,7 +109,7 @@ def test_an_av1_video_is_its_own_stream(clip: Path) -> None:
     assert source.pictures.presented is None
 
 
-def test_frames_that_are_not_shown_are_in_the_stream(trimmed: Path) -> None:
+def test_frames_that_are_not_shown_have_no_tracks(trimmed: Path) -> None:
     source = opened(trimmed)
     assert source.stream.num_packets == 16
     assert source.pictures.presented is not None
@@ -122,7 +122,9 @@ def test_frames_that_are_not_shown_are_in_the_stream(trimmed: Path) -> None:
     np.testing.assert_allclose(np.diff(times), 1 / 25)
 
 
-def test_times_are_those_of_all_frames_or_none(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_frame_times_are_given_for_all_frames_or_none(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
     source = opened(clip)
     times = times_of_frames(source, 7)
     assert times is not None
@@ -134,10 +136,10 @@ def test_times_are_those_of_all_frames_or_none(clip: Path, ffmpeg: Ffmpeg, tmp_p
     assert times_of_frames(opened(timeless), 16) is None
 
 
-def test_a_poor_stream_is_told_of_where_it_could_be_converted(
+def test_poor_stream_is_reported_if_it_could_be_reencoded(
     encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path
 ) -> None:
-    """Not where it was: the encoder's settings are this package's own."""
+    """A stream that this package encoded is not reported."""
     often = encode(make_frames(12), tmp_path / "often.mp4", *AV1[:-1], "4")
     source = opened(often)
     (note,) = tracked(source).warnings
@@ -147,7 +149,7 @@ def test_a_poor_stream_is_told_of_where_it_could_be_converted(
     assert tracked(replace(source, pictures=read_video(video))).warnings == ()
 
 
-def test_what_lies_over_the_picture_is_told_of(encode: Encode, tmp_path: Path) -> None:
+def test_overlay_is_reported(encode: Encode, tmp_path: Path) -> None:
     frames = make_frames(12)
     plain = tracked(opened(encode(frames, tmp_path / "plain.mp4")))
     frames[:, 32:96, 48:112] = frames[0, 32:96, 48:112]
@@ -160,7 +162,7 @@ def test_what_lies_over_the_picture_is_told_of(encode: Encode, tmp_path: Path) -
     assert f"{share:.0%}" in note
 
 
-def test_stages_do_not_count_twice(clip: Path) -> None:
+def test_time_of_a_stage_is_counted_once(clip: Path) -> None:
     clock = Clock()
     lk = replace(OPTIONS, refine=RefineOptions(refine="lk"))
     calls: list[tuple[str, int, int | None]] = []
@@ -180,26 +182,26 @@ def test_stages_do_not_count_twice(clip: Path) -> None:
 
 @pytest.fixture
 def hurt(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> Path:
-    """The clip with its last frames cut off."""
+    """The clip, truncated."""
     whole = ffmpeg("-i", clip, "-c", "copy", tmp_path / "whole.ivf")
     cut = tmp_path / "cut.ivf"
     cut.write_bytes(whole.read_bytes()[: int(whole.stat().st_size * 0.7)])
     return cut
 
 
-def test_pictures_end_before_the_damage(hurt: Path) -> None:
+def test_decoding_stops_at_the_damage(hurt: Path) -> None:
     with pytest.warns(UserWarning, match=r"cut\.ivf"):
         count = len(list(decodable_frames(read_video(hurt), 16, OPTIONS.reading)))
     assert 4 < count < 16
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # the frames that are asked for are whole
+        warnings.simplefilter("error")  # the requested frames are intact
         whole = list(decodable_frames(read_video(hurt), count, OPTIONS.reading))
     assert [index for index, _ in whole] == list(range(count))
     with pytest.raises(BitstreamError, match=r"cut\.ivf"):
         list(decodable_frames(read_video(hurt), 16, STRICT.reading))
 
 
-def test_pictures_are_those_of_the_frames_with_tracks(clip: Path) -> None:
+def test_decodable_frames_are_the_first_frames(clip: Path) -> None:
     asked = list(decodable_frames(read_video(clip), 3, OPTIONS.reading))
     assert [index for index, _ in asked] == [0, 1, 2]
     for (_, picture), (_, whole) in zip(asked, decode_frames(clip), strict=False):
