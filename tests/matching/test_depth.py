@@ -1,4 +1,4 @@
-"""Whether matches determine depth, and what the commands do where they do not."""
+"""Detection of matches that do not determine depth, and how the commands report it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OPTIONS = MatchOptions(images=ImageOptions(every=3))
 
 
 def zoomed(scene: Scene, most: float) -> Scene:
-    """The scene as a lens shows it that zooms steadily."""
+    """The scene seen by a lens that zooms steadily."""
     tracks = scene.tracks
     centre = np.array([WIDTH / 2, HEIGHT / 2])
     zoom = 1 + (most - 1) * tracks.frame[:, None] / tracks.num_frames
@@ -53,8 +53,8 @@ def evidence(scene: Scene, focal_length: float = FOCAL) -> DepthEvidence:
 
 
 @pytest.mark.parametrize("focal_length", [300.0, FOCAL, 2000.0])
-def test_a_camera_that_turns_or_zooms(focal_length: float) -> None:
-    """What focal length the camera is assumed to have does not matter."""
+def test_depth_is_not_observable_if_the_camera_only_turns_or_zooms(focal_length: float) -> None:
+    """The assumed focal length does not matter."""
     turning = make_scene(turning=True, arc_degrees=120)
     for scene in (turning, zoomed(turning, 0.5), zoomed(make_scene(arc_degrees=0.2), 2.0)):
         found = evidence(scene, focal_length)
@@ -65,21 +65,21 @@ def test_a_camera_that_turns_or_zooms(focal_length: float) -> None:
 
 @pytest.mark.parametrize("flat", [False, True])
 @pytest.mark.parametrize("zoom", [1.0, 1.5])
-def test_a_camera_that_moves(flat: bool, zoom: float) -> None:
+def test_depth_is_observable_if_the_camera_moves(flat: bool, zoom: float) -> None:
     found = evidence(zoomed(make_scene(flat=flat), zoom))
     assert found.num_with_parallax > 8
     assert found.is_observable
     assert found.warning is None
 
 
-def test_a_camera_that_moves_at_the_end() -> None:
+def test_depth_warning_if_the_camera_moves_only_at_the_end() -> None:
     found = DepthEvidence(num_pairs=40, num_with_parallax=14)
     assert found.is_observable
     assert found.warning is not None
 
 
 @pytest.mark.shared
-def test_every_command_speaks_of_a_zoom(
+def test_every_command_reports_that_depth_is_not_observable(
     shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     video, database = shared / "cases" / "zoom.mjpeg", tmp_path / "zoom.db"

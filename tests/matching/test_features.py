@@ -11,10 +11,10 @@ from colmap_av1.matching.features.sift import extract_features, match_features
 
 @pytest.mark.parametrize("effort", ["light", "full"])
 @pytest.mark.parametrize("size", [(1920, 1080), (1601, 901)])
-def test_features_of_large_pictures_are_found_where_they_are(
+def test_features_of_large_pictures_are_located_accurately(
     size: tuple[int, int], effort: Literal["light", "full"]
 ) -> None:
-    """A large picture, in which features are looked for in a smaller one, and a part of it."""
+    """Features of a large picture are found at reduced size; those of a part at full size."""
     noise = np.random.default_rng(0).standard_normal((135, 240)).astype(np.float32)
     large = cv2.resize(cv2.GaussianBlur(noise, (0, 0), 1.0), size, interpolation=cv2.INTER_CUBIC)
     large = cv2.cvtColor(np.clip(128 + 90 * large, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
@@ -28,7 +28,7 @@ def test_features_of_large_pictures_are_found_where_they_are(
     assert np.abs(np.median(off, axis=0)).max() < 0.1
 
 
-def test_plain_pictures_have_no_features() -> None:
+def test_untextured_pictures_have_no_features() -> None:
     for size in ((1, 1), (40, 60)):
         found = extract_features(np.full((*size, 3), 90, np.uint8), 100)
         assert found.xy.shape == (0, 2)

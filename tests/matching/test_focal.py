@@ -19,19 +19,19 @@ def estimate(tracks: Tracks, pixel_aspect: float = 1.0) -> float | None:
     return estimate_focal_length(keypoints, pairs, matches, size, pixel_aspect=pixel_aspect)
 
 
-def test_walk() -> None:
+def test_focal_length_of_a_walk_is_estimated() -> None:
     found = estimate(walk())
     assert found == pytest.approx(FOCAL, rel=0.04)
     assert estimate(walk()) == found
 
 
-def test_oblong_pixels() -> None:
+def test_focal_length_with_non_square_pixels() -> None:
     tracks = walk()
     narrow = replace(tracks, width=WIDTH // 2, xy=tracks.xy / np.array([2, 1], np.float32))
     assert estimate(narrow, pixel_aspect=2.0) == pytest.approx(FOCAL, rel=0.04)
 
 
-def test_wrong_matches() -> None:
+def test_focal_length_with_outliers() -> None:
     tracks, rng = walk(), np.random.default_rng(0)
     xy = tracks.xy.copy()
     wrong = rng.random(len(xy)) < 0.1
@@ -39,25 +39,25 @@ def test_wrong_matches() -> None:
     assert estimate(replace(tracks, xy=xy)) == pytest.approx(FOCAL, rel=0.08)
 
 
-def test_motion_along_the_axis() -> None:
+def test_forward_motion_gives_no_focal_length() -> None:
     t = np.linspace(0, 1, NUM_FRAMES)[:, None]
     assert estimate(seen_by(np.hstack([0 * t, 0 * t, 4 * t]), np.zeros((NUM_FRAMES, 3)))) is None
 
 
-def test_circle_around_what_the_camera_looks_at() -> None:
-    """Pairs with axes that meet at equal distance tell no focal length."""
+def test_orbit_gives_no_focal_length() -> None:
+    """The focal length is not observable if optical axes meet at equal distances."""
     angle = np.linspace(-0.5, 0.5, NUM_FRAMES)[:, None]
     centre = np.hstack([12 * np.sin(angle), 0 * angle, 12 - 12 * np.cos(angle)])
     found = estimate(seen_by(centre, np.hstack([0 * angle, angle, 0 * angle])))
     assert found is None
 
 
-def test_standing_still() -> None:
+def test_still_camera_gives_no_focal_length() -> None:
     assert estimate(seen_by(np.zeros((NUM_FRAMES, 3)), np.zeros((NUM_FRAMES, 3)))) is None
     tracks = walk()
     xy = np.repeat(tracks.xy[::NUM_FRAMES], NUM_FRAMES, axis=0)
     assert estimate(replace(tracks, xy=xy)) is None
 
 
-def test_too_few_matches() -> None:
+def test_too_few_matches_give_no_focal_length() -> None:
     assert estimate(walk(num_points=40)) is None

@@ -1,4 +1,4 @@
-"""Gaps between the images of a video that motion connects badly."""
+"""Gaps: neighbouring images of a video that motion connects badly."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REACH = 6
 
 
 def chain(thin: dict[int, float]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of a video and their matches, where only shares of these cross some gaps."""
+    """Pairs of a video and their match counts, reduced to a share across the given gaps."""
     pairs = np.array(
         [(i, j) for i in range(NUM_IMAGES) for j in range(i + 1, min(i + REACH, NUM_IMAGES))]
     )
@@ -33,22 +33,22 @@ def chain(thin: dict[int, float]) -> tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 def names_of(folder: str) -> list[str]:
-    # '9' comes after '10' in the order of letters.
+    # In alphabetical order, '9' comes after '10'.
     return [f"{folder}{i}.png" for i in range(NUM_IMAGES)]
 
 
-def test_gaps_that_few_matches_cross() -> None:
+def test_gaps_with_few_matches_are_found() -> None:
     names, rows = names_of(""), [0] * NUM_IMAGES
     assert few_match_gaps(*chain({}), names, rows) == ()
     assert few_match_gaps(*chain({9: 0.7}), names, rows) == ()
     (gap,) = few_match_gaps(*chain({9: 0.1}), names, rows)
     assert (gap.before, gap.after) == ("9.png", "10.png")
     assert gap.share < 0.15
-    # Beside a gap that nothing crosses images become separate models, which is said elsewhere.
+    # A gap without any matches splits the images into separate models, which is reported elsewhere.
     assert few_match_gaps(*chain({9: 0.0}), names, rows) == ()
 
 
-def test_a_warning_names_gaps_and_the_least_share() -> None:
+def test_warning_names_gaps_and_the_smallest_share() -> None:
     assert few_matches_warning(()) is None
     gaps = [
         Gap(f"{i}.png", f"{i + 1}.png", ("few tracks",), share=0.3 - 0.05 * i) for i in range(5)
@@ -62,8 +62,8 @@ def test_a_warning_names_gaps_and_the_least_share() -> None:
 
 
 @given(st.randoms(use_true_random=False), st.integers(8, 20))
-def test_gaps_are_those_of_each_video_in_any_order_of_images(random: object, gap: int) -> None:
-    """Images are numbered as a database happens to list them."""
+def test_gaps_do_not_depend_on_the_order_of_images(random: object, gap: int) -> None:
+    """A database may list images of several videos in any order."""
     names = names_of("a/") + names_of("b/")
     rows = [name[0] for name in names]
     first, second = chain({gap: 0.1}), chain({})
@@ -80,27 +80,27 @@ def test_gaps_are_those_of_each_video_in_any_order_of_images(random: object, gap
     assert found == expected
 
 
-def test_low_inter_frames_are_those_without_motion_among_others() -> None:
+def test_frames_with_an_unusually_low_inter_share_are_found() -> None:
     usual = np.full(30, 0.85, np.float32)
     usual[0] = 0
     assert not low_inter_frames(usual).any()
     jerk = usual.copy()
     jerk[12] = 0.18
     assert np.flatnonzero(low_inter_frames(jerk)).tolist() == [12]
-    # A drive: half of the units are inter coded everywhere, a slow frame has a third.
+    # A drive: usually half of the units are inter coded; a slow frame has a third.
     drive = np.full(30, 0.5, np.float32)
     drive[[0, 8, 20]] = 0, 0.33, 0.15
     assert np.flatnonzero(low_inter_frames(drive)).tolist() == [20]
-    # Where the camera is always too fast, no motion is to be trusted.
-    # What only compresses well is found across a jerk, too.
+    # In a clip that compresses well, half of the usual share is low.
     half = np.full(40, 0.94, np.float32)
     half[17], half[30] = 0.47, 0.62
     assert np.flatnonzero(low_inter_frames(half)).tolist() == [17]
+    # If the camera is always too fast, all frames are low.
     assert low_inter_frames(np.full(9, 0.04, np.float32))[1:].all()
 
 
 @pytest.mark.parametrize("num_frames", [0, 1, 2, 9, 50])
-def test_inter_share_is_compared_with_the_median_of_frames_around(num_frames: int) -> None:
+def test_inter_share_is_compared_with_the_median_of_nearby_frames(num_frames: int) -> None:
     share = np.random.default_rng(num_frames).random(num_frames, np.float32)
     usual = [np.median(share[max(1, i - 8) : i + 9]) for i in range(1, num_frames)]
     for certain, least in ((False, 0.55), (True, 0.4)):

@@ -38,7 +38,7 @@ def paired(tracks: Tracks, **options: int) -> PairedImages:
 
 
 def approach() -> Tracks:
-    """What a camera sees that moves along its axis."""
+    """Tracks of a camera that moves along its optical axis."""
     ahead = np.zeros((NUM_FRAMES, 3))
     ahead[:, 2] = np.linspace(0, 3, NUM_FRAMES)
     return seen_by(ahead, np.zeros((NUM_FRAMES, 3)))
@@ -62,7 +62,7 @@ def test_pairs_match_keypoints_of_the_same_track() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_too_little_to_match_is_an_error() -> None:
+def test_too_few_matches_are_an_error() -> None:
     tracks = make_scene(num_frames=5).tracks
     with pytest.raises(VideoError, match="--min_length"):
         paired(tracks, min_length=6)
@@ -70,7 +70,7 @@ def test_too_little_to_match_is_an_error() -> None:
         paired(tracks, min_matches=10**4)
 
 
-def test_a_focal_length_is_looked_for_where_none_is_given() -> None:
+def test_focal_length_is_estimated_unless_given() -> None:
     images = paired(walk())
 
     def found(camera: CameraOptions) -> float | None:
@@ -82,7 +82,7 @@ def test_a_focal_length_is_looked_for_where_none_is_given() -> None:
     assert found(CameraOptions("OPENCV_FISHEYE")) is None
 
 
-def test_forward_motion_is_told_by_pairs_with_known_intrinsics() -> None:
+def test_forward_motion_is_detected_with_known_intrinsics() -> None:
     aside, ahead = paired(make_scene(num_frames=8).tracks), paired(approach())
 
     def is_forward(images: PairedImages, camera: CameraOptions) -> bool:

@@ -29,7 +29,7 @@ ANGLE = 6.0
 def two_views(
     bend: float, rng: np.random.Generator, count: int = 160, angle: float = ANGLE
 ) -> tuple[list[ImageKeypoints], NDArray[np.uint32]]:
-    """Two views of a wall that bends away from them, `angle` degrees apart."""
+    """Two views of a curved wall, `angle` degrees apart."""
     x = rng.uniform((-0.4, -0.25), (0.4, 0.25), (count, 2))
     depth = 1 + 0.3 * x[:, 0] + bend * (x**2).sum(axis=1)
     points = np.c_[x * depth[:, None], depth]
@@ -46,7 +46,7 @@ def two_views(
 def turned_views(
     spread: float, depth: float, count: int, rng: np.random.Generator
 ) -> tuple[list[ImageKeypoints], NDArray[np.uint32]]:
-    """Two views 20 degrees apart, of what lies within `spread` of the axis and `depth` of 1."""
+    """Two views, 20 degrees apart, of points within `spread` of the axis and `depth` of 1."""
     x = rng.uniform((-spread, -spread), (spread, spread), (count, 2))
     points = np.c_[x, np.ones(count)] * (1 + rng.uniform(-depth, depth, count))[:, None]
     turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
@@ -69,7 +69,7 @@ def demoted(keypoints: list[ImageKeypoints], geometry: TwoViewGeometry) -> TwoVi
 
 
 def angle_of_mapper(keypoints: list[ImageKeypoints], matches: NDArray[np.uint32]) -> float:
-    """The triangulation angle by which COLMAP's mapper judges a pair, in degrees."""
+    """The triangulation angle that COLMAP's mapper computes for a pair, in degrees."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.min_num_trials = 30
     options.ransac.max_error = 4.0
@@ -80,8 +80,8 @@ def angle_of_mapper(keypoints: list[ImageKeypoints], matches: NDArray[np.uint32]
     return float(np.degrees(found.tri_angle))
 
 
-def test_parallax_taken_for_noise() -> None:
-    """Pairs that the mapper would take for half as far apart again do not begin a model."""
+def test_pairs_with_an_overestimated_angle_are_demoted() -> None:
+    """The mapper would overestimate the angle of these pairs by 40 % or more."""
     rng = np.random.default_rng(0)
     for _ in range(10):
         keypoints, matches = two_views(1.2, rng)
@@ -96,8 +96,8 @@ def test_parallax_taken_for_noise() -> None:
         assert vars(rest) == vars(geometry)
 
 
-def test_plane() -> None:
-    """Where the pose of the homography is right the pair stays."""
+def test_planar_pair_with_a_correct_pose_is_kept() -> None:
+    """The pose from the homography is correct here."""
     rng = np.random.default_rng(1)
     for _ in range(10):
         keypoints, matches = two_views(0.0, rng, angle=14.0)
@@ -108,13 +108,13 @@ def test_plane() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 15, 49])
-def test_pairs_that_cannot_start(count: int) -> None:
+def test_pairs_with_too_few_inliers_are_unchanged(count: int) -> None:
     keypoints, matches = two_views(1.2, np.random.default_rng(2), count)
     geometry = verified(keypoints, matches)
     assert demoted(keypoints, geometry) is geometry
 
 
-def test_unknown_focal_length() -> None:
+def test_planar_pair_with_unknown_focal_length_is_kept() -> None:
     keypoints, matches = two_views(1.2, np.random.default_rng(3))
     unknown = make_camera(CameraOptions(), WIDTH, HEIGHT)
     geometry = verify_pairs(keypoints, PAIR, [matches], unknown)[0]
@@ -122,10 +122,10 @@ def test_unknown_focal_length() -> None:
     assert demoted(keypoints, geometry) is geometry
 
 
-def test_camera_adjusted_far_off() -> None:
-    """Where a hundred matches leave the focal length and the distortion open, a pair is not first.
+def test_pair_whose_camera_would_diverge_is_demoted() -> None:
+    """About a hundred matches do not determine the focal length and the distortion here.
 
-    But where there is no better one it stays: nothing is gained then.
+    Without a better pair, such a pair is kept: demoting it would gain nothing.
     """
     rng = np.random.default_rng(4)
     better = turned_views(0.25, 0.3, 400, rng)
@@ -150,7 +150,7 @@ def test_camera_adjusted_far_off() -> None:
     assert num_demoted > 5
 
 
-def test_camera_adjusted_far_off_after_many_iterations() -> None:
+def test_pair_whose_camera_diverges_slowly_is_demoted() -> None:
     """Focal length and two distortion parameters diverge slowly from two views."""
     camera = make_camera(CameraOptions(camera_model="RADIAL"), WIDTH, HEIGHT)
     keypoints, matches = turned_views(0.3, 0.1, 120, np.random.default_rng(1))
@@ -164,8 +164,8 @@ def test_camera_adjusted_far_off_after_many_iterations() -> None:
     assert len(geometry.inlier_matches) >= INITIAL_MIN_INLIERS > len(found.inlier_matches)
 
 
-def test_pairs_with_few_inliers_if_no_pair_has_a_large_angle() -> None:
-    """The mapper tries these first then, and might begin with any of them by chance."""
+def test_pairs_with_few_inliers_are_demoted_if_no_pair_has_a_large_angle() -> None:
+    """The mapper would try these first and might start with any of them."""
     rng = np.random.default_rng(0)
     pairs = np.array([[0, 1], [2, 9], [3, 4]], dtype=np.int32)
     nothing = np.empty((0, 2), np.float32)
@@ -189,8 +189,8 @@ def test_pairs_with_few_inliers_if_no_pair_has_a_large_angle() -> None:
     assert found[2] is geometries[2]
 
 
-def test_the_mapper_begins_with_the_first_model() -> None:
-    """A pair of another model has few inliers at a large angle, which the mapper tries first."""
+def test_pairs_of_other_models_are_demoted() -> None:
+    """The mapper would try the pair with few inliers and a large angle first."""
     rng = np.random.default_rng(0)
     pairs = np.array([[0, 1], [2, 9]], dtype=np.int32)
     nothing = np.empty((0, 2), np.float32)
@@ -212,7 +212,7 @@ def test_the_mapper_begins_with_the_first_model() -> None:
         assert kept == expected
 
 
-def test_a_pair_whose_own_pose_is_wrong_is_demoted() -> None:
+def test_pair_with_a_wrong_pose_is_demoted() -> None:
     rng = np.random.default_rng(3)
     keypoints, matches = turned_views(0.5, 0.3, 300, rng)
     geometry = verified(keypoints, matches)

@@ -1,4 +1,4 @@
-"""SIFT links of recorded clips: text over the pictures, a cut, and a camera too fast for motion."""
+"""SIFT links in recorded clips: with an overlay, a cut, and a camera too fast for motion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from colmap_av1.match import match
 from colmap_av1.options import LinkOptions, MatchOptions
 from colmap_av1.video.decoding import decode_frames
 
-# Enough for these pictures; the time grows with the square of the number.
+# Enough for these frames; the time grows with the square of this number.
 FEWER_FEATURES = MatchOptions(links=LinkOptions(max_link_features=600))
 
 
@@ -26,10 +26,8 @@ def pictures(video: Path) -> list[NDArray[np.uint8]]:
 
 @pytest.mark.slow
 @pytest.mark.shared
-def test_text_over_the_pictures_is_no_place_seen_again(
-    shared: Path, encode: Encode, tmp_path: Path
-) -> None:
-    """As drones' displays are recorded: the same in all pictures, so 90 pairs would be linked."""
+def test_overlay_text_causes_no_loop_closures(shared: Path, encode: Encode, tmp_path: Path) -> None:
+    """A recorded drone display is the same in all frames; it would link 90 pairs."""
     left_out = {*range(29, 39), *range(56, 66)}
     clip = pictures(shared / "sequences" / "log_building" / "clip.mp4")
     frames = np.array([clip[i] for i in range(17, 76) if i not in left_out])
@@ -45,8 +43,8 @@ def test_text_over_the_pictures_is_no_place_seen_again(
     assert report.links.num_revisits < 25
 
 
-def test_no_picture_is_decoded_for_a_calm_video(shared: Path, tmp_path: Path) -> None:
-    """The selection of tracks that are matched leaves fewer of them long than there are."""
+def test_calm_video_needs_no_decoded_pictures(shared: Path, tmp_path: Path) -> None:
+    """Gaps are judged by all tracks; the selected tracks include too few long ones."""
     report = match(tmp_path / "a.db", shared / "sequences" / "log_building" / "clip.mp4")
     assert report.links.num_images == 0
     assert report.links.fast == ()
@@ -54,10 +52,10 @@ def test_no_picture_is_decoded_for_a_calm_video(shared: Path, tmp_path: Path) ->
 
 @pytest.mark.slow
 @pytest.mark.shared
-def test_cut_to_what_was_seen_elsewhere_needs_few_features(
+def test_cut_to_a_known_place_is_linked_with_few_features(
     shared: Path, encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The images on either side of the cut show nothing in common, others do."""
+    """The two images at the cut show nothing in common, but other images do."""
     monkeypatch.delattr("colmap_av1.matching.links.thorough_plan")
     clip = pictures(shared / "sequences" / "log_building" / "clip.mp4")
     cut = encode(
@@ -74,7 +72,7 @@ def test_cut_to_what_was_seen_elsewhere_needs_few_features(
 @pytest.mark.slow
 @pytest.mark.shared
 def test_camera_too_fast_for_motion_is_linked(shared: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
-    """A drone whose pictures move by 85 px a frame: the encoder finds next to no motion."""
+    """Drone frames move by 85 px each, so the encoder finds almost no motion."""
     clip = shared / "sequences" / "drone_park" / "clip.mp4"
     video = ffmpeg("-i", clip, "-frames:v", "16", "-c", "copy", tmp_path / "video.mp4")
     report = match(tmp_path / "a.db", video)
@@ -82,7 +80,7 @@ def test_camera_too_fast_for_motion_is_linked(shared: Path, ffmpeg: Ffmpeg, tmp_
     assert len(report.links.gaps) == 15
     assert len(report.links.frames_of_gaps("contradicted")) > 12
     assert check_database(tmp_path / "a.db").num_connected_images == 16
-    # No focal length is known, and what the camera flies over is flat.
+    # The focal length is unknown and the ground is flat.
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
     models = pycolmap.incremental_mapping(tmp_path / "a.db", tmp_path, tmp_path / "model", options)
     assert models[0].num_reg_images() == 16

@@ -1,4 +1,4 @@
-"""COLMAP's own words and numbers, as the installed pycolmap has them."""
+"""Copied constants of COLMAP agree with the installed pycolmap."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from colmap_av1.matching import mapper_limits as limits
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, config_name
 
 
-def test_limits_are_those_of_colmaps_mappers() -> None:
+def test_limits_agree_with_colmap() -> None:
     incremental = pycolmap.IncrementalPipelineOptions()
     assert incremental.min_num_matches == limits.MIN_INLIERS
     assert pycolmap.GlobalPipelineOptions().min_num_matches == limits.MIN_INLIERS
@@ -18,7 +18,7 @@ def test_limits_are_those_of_colmaps_mappers() -> None:
     assert incremental.mapper.init_min_tri_angle == limits.INITIAL_MIN_ANGLE
 
 
-def test_configurations_are_those_of_colmap() -> None:
+def test_two_view_configurations_agree_with_colmap() -> None:
     colmaps = pycolmap.TwoViewGeometryConfiguration.__members__
     ours = {config.name: config.value for config in TwoViewConfig}
     assert ours == {name: int(member.value) for name, member in colmaps.items()}

@@ -1,4 +1,4 @@
-"""Features of logos and displays over the pictures, which are no part of the scene."""
+"""Features on overlays, such as logos and displays, are removed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def camera(size: tuple[int, int] = SIZE) -> pycolmap.Camera:
 
 
 def unit(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-    """Descriptors that are unlike each other."""
+    """Random descriptors, all different."""
     drawn = rng.normal(size=(count, 128))
     return np.asarray(drawn / np.linalg.norm(drawn, axis=1, keepdims=True), np.float32)
 
@@ -30,7 +30,7 @@ def unit(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
 def views(
     num_images: int, step: float, num_over: int, seed: int
 ) -> tuple[dict[int, Features], NDArray[np.bool_]]:
-    """Features of a scene that moves by so many pixels from image to image, and of an overlay."""
+    """Features of a scene that moves by `step` pixels per image, and of an overlay."""
     rng = np.random.default_rng(seed)
     scene, over = rng.uniform((0, 0), SIZE, (300, 2)), rng.uniform((0, 0), (80, 32), (num_over, 2))
     descriptors = unit(rng, 300 + num_over)
@@ -48,7 +48,7 @@ def views(
     num_over=st.integers(1, 60),
     seed=st.integers(0, 1000),
 )
-def test_what_stays_in_its_place_is_left_out(
+def test_overlay_features_are_removed(
     num_images: int, step: float, num_over: int, seed: int
 ) -> None:
     features, is_over = views(num_images, step, num_over, seed)
@@ -58,14 +58,14 @@ def test_what_stays_in_its_place_is_left_out(
         whole = features[image]
         kept = (whole.xy[:, None] == own.xy[None]).all(axis=2).any(axis=1)
         assert not kept[is_over].any()
-        # Beside it at most what lies in the same cells.
+        # Scene features are removed only in the cells of the overlay, with few exceptions.
         over = set(map(tuple, whole.xy[is_over].astype(int) // 16))
         gone = set(map(tuple, whole.xy[~kept].astype(int) // 16))
         assert len(gone - over) <= 0.1 * 300
         assert len(own.xy) == len(own.descriptors) == np.count_nonzero(kept)
 
 
-def test_nothing_is_left_out_where_all_stays_or_all_moves() -> None:
+def test_nothing_is_removed_if_everything_stays_or_moves() -> None:
     for step, num_over in ((0.0, 40), (0.1, 0), (15.0, 0)):
         features, _ = views(8, step, num_over, seed=1)
         found = without_overlays(features, [camera()] * 24)

@@ -15,7 +15,7 @@ from colmap_av1.tracks.tracks import Tracks
 
 
 def tracks_from(spans: list[list[int]], num_frames: int = 10) -> Tracks:
-    """Track t is seen in the frames spans[t], at (100 t + frame, t)."""
+    """Track t is observed in the frames spans[t], at (100 t + frame, t)."""
     frame = np.array([f for span in spans for f in span], dtype=np.int32)
     track = np.repeat(np.arange(len(spans)), [len(s) for s in spans])
     offsets = np.concatenate([[0], np.cumsum([len(s) for s in spans])]).astype(np.int64)
@@ -32,11 +32,11 @@ def images_seeing(tracks_of_image: list[list[int]]) -> list[ImageKeypoints]:
     ]
 
 
-def test_keypoints_of_chosen_frames() -> None:
+def test_keypoints_are_those_of_the_chosen_frames() -> None:
     tracks = tracks_from([[0, 1, 2], [2, 3], [1, 3, 5], [4, 5, 6]])
     images = image_keypoints(tracks, [0, 2, 5])
     assert [k.frame for k in images] == [0, 2, 5]
-    # Tracks 1, 2 and 3 are seen in one of the frames only.
+    # Tracks 1, 2 and 3 are observed in only one of the frames.
     assert [k.track.tolist() for k in images] == [[0], [0], []]
     assert images[1].xy.tolist() == [[2.0, 0.0]]
     assert images[2].xy.shape == (0, 2)
@@ -47,7 +47,7 @@ def test_keypoints_of_chosen_frames() -> None:
     st.lists(st.sets(st.integers(0, 9), min_size=1), max_size=20),
     st.sets(st.integers(0, 9)),
 )
-def test_keypoints_agree_with_a_plain_loop(spans: list[set[int]], chosen: set[int]) -> None:
+def test_keypoints_agree_with_a_simple_loop(spans: list[set[int]], chosen: set[int]) -> None:
     tracks = tracks_from([sorted(s) for s in spans])
     images = image_keypoints(tracks, sorted(chosen))
     kept = [t for t, span in enumerate(spans) if len(span & chosen) >= 2]
@@ -58,7 +58,7 @@ def test_keypoints_agree_with_a_plain_loop(spans: list[set[int]], chosen: set[in
 
 
 @pytest.mark.parametrize("frames", [[0, 10], [-1, 3], [3, 3], [4, 2]])
-def test_frames_that_do_not_fit(frames: list[int]) -> None:
+def test_invalid_frames_are_refused(frames: list[int]) -> None:
     with pytest.raises(ImageError):
         image_keypoints(tracks_from([[0, 1]]), frames)
 
@@ -73,7 +73,7 @@ def test_matches_join_keypoints_of_a_track(a: set[int], b: set[int]) -> None:
 
 
 def test_schedule_reaches_the_longest_span() -> None:
-    # 20 tracks start at every image and are seen in 24 images.
+    # 20 tracks start at every image and are observed in 24 images.
     images = images_seeing(
         [[20 * s + k for s in range(max(0, i - 23), i + 1) for k in range(20)] for i in range(100)]
     )
@@ -86,14 +86,14 @@ def test_schedule_reaches_the_longest_span() -> None:
     assert pairs.tolist() == sorted(pairs.tolist())
 
 
-def test_schedule_stays_linear_where_tracks_never_end() -> None:
+def test_schedule_grows_linearly_even_if_tracks_never_end() -> None:
     images = images_seeing([list(range(20))] * 1200)
     half = len(schedule_pairs(images[:600]))
     assert len(schedule_pairs(images)) < 2.15 * half
     assert half < 18 * 600
 
 
-def test_schedule_keeps_pairs_with_enough_matches_only() -> None:
+def test_schedule_only_keeps_pairs_with_enough_matches() -> None:
     images = images_seeing([list(range(20)), list(range(5, 30)), list(range(6, 30)), []])
     assert schedule_pairs(images).tolist() == [[0, 1], [1, 2]]
     assert schedule_pairs(images, PairOptions(min_matches=14)).tolist() == [[0, 1], [0, 2], [1, 2]]
@@ -104,7 +104,7 @@ def test_schedule_keeps_pairs_with_enough_matches_only() -> None:
     assert schedule_pairs([]).shape == (0, 2)
 
 
-def test_schedule_without_growth_takes_the_offsets() -> None:
+def test_schedule_without_growth_uses_the_offsets() -> None:
     images = images_seeing([list(range(20))] * 12)
     pairs = schedule_pairs(images, PairOptions(offsets=(3, 1), growth=1.0))
     expected = [(i, j) for i, j in combinations(range(12), 2) if j - i in (1, 3)]

@@ -28,7 +28,7 @@ KNOWN = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
 def prepare(
     scene: Scene, outliers: float = 0.0
 ) -> tuple[list[ImageKeypoints], NDArray[np.int32], list[NDArray[np.uint32]]]:
-    """Keypoints, pairs and matches, a share of which is joined at random."""
+    """Keypoints, pairs and matches, a share of which is replaced by random ones."""
     keypoints = image_keypoints(scene.tracks, range(scene.tracks.num_frames))
     pairs = schedule_pairs(keypoints)
     matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs]
@@ -68,7 +68,7 @@ def agreement_with_colmap(
     camera: pycolmap.Camera,
     ours: Sequence[TwoViewGeometry],
 ) -> tuple[list[bool], list[float]]:
-    """For each pair whether COLMAP decides the same, and the share of inliers in common."""
+    """For each pair, whether COLMAP chooses the same configuration, and the IoU of the inliers."""
     same, overlap = [], []
     for pair, m, geometry in zip(pairs, matches, ours, strict=True):
         theirs = colmap_geometry(keypoints, pair, m, camera)
@@ -90,7 +90,7 @@ def agreement_with_colmap(
     ],
     ids=["calibrated", "uncalibrated", "flat", "flat uncalibrated", "turning"],
 )
-def test_same_decisions_as_colmap(
+def test_configurations_agree_with_colmap(
     camera: pycolmap.Camera, scene: Scene, config: TwoViewConfig
 ) -> None:
     keypoints, pairs, matches = prepare(scene, outliers=0.2)
@@ -101,7 +101,7 @@ def test_same_decisions_as_colmap(
     assert np.mean([g.config == config for g in ours]) >= 0.9
 
 
-def test_planar_pairs_of_two_cameras_keep_the_larger_set() -> None:
+def test_planar_pairs_of_two_cameras_keep_the_larger_inlier_set() -> None:
     keypoints, pairs, matches = prepare(make_scene(flat=True, noise=0.5), outliers=0.1)
     first, second = copy.copy(UNKNOWN), copy.copy(UNKNOWN)
     cameras = [(first, second)[i % 2] for i in range(len(keypoints))]
@@ -123,7 +123,7 @@ def test_planar_pairs_of_two_cameras_keep_the_larger_set() -> None:
     assert len(ours.inlier_matches) >= 0.98 * len(theirs.inlier_matches)
 
 
-def test_pose_against_truth() -> None:
+def test_relative_pose_matches_the_truth() -> None:
     scene = make_scene(noise=0.1)
     keypoints, pairs, matches = prepare(scene, outliers=0.1)
     for (i, j), g in zip(pairs, verify_pairs(keypoints, pairs, matches, KNOWN), strict=True):
@@ -145,7 +145,7 @@ def test_pose_against_truth() -> None:
         assert np.allclose(E / np.linalg.norm(E), g.E, atol=1e-6)
 
 
-def test_fundamental_matrix_maps_pixels_to_lines_of_the_second_image() -> None:
+def test_fundamental_matrix_maps_to_epipolar_lines_of_the_second_image() -> None:
     keypoints, pairs, matches = prepare(make_scene(noise=0.1), outliers=0.1)
     geometries = verify_pairs(keypoints, pairs, matches, UNKNOWN)
     for (i, j), g in zip(pairs, geometries, strict=True):
@@ -160,7 +160,7 @@ def test_fundamental_matrix_maps_pixels_to_lines_of_the_second_image() -> None:
         assert np.median(distance / np.hypot(lines[:, 0], lines[:, 1])) < 0.5
 
 
-def test_outliers_are_left_out() -> None:
+def test_outliers_are_rejected() -> None:
     scene = make_scene(noise=0.2)
     keypoints, pairs, clean = prepare(scene)
     _, _, matches = prepare(scene, outliers=0.3)
@@ -172,11 +172,11 @@ def test_outliers_are_left_out() -> None:
         kept = set(map(tuple, g.inlier_matches.tolist()))
         true = set(map(tuple, right.tolist())) & set(map(tuple, m.tolist()))
         assert len(kept & true) >= 0.97 * len(true), (i, j)
-        # A wrong match survives where it happens to lie on its epipolar line.
+        # A wrong match remains if it happens to lie on its epipolar line.
         assert len(kept - true) <= 0.25 * len(m), (i, j)
 
 
-def test_bytes_do_not_depend_on_threads_but_on_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_result_depends_on_the_seed_but_not_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verify, "_PAIRS_FOR_A_THREAD", 10)
     keypoints, pairs, matches = prepare(make_scene(num_points=2500), outliers=0.2)
 
@@ -197,7 +197,7 @@ def test_order_of_the_pairs_does_not_matter() -> None:
     assert [as_bytes(mixed[k]) for k in np.argsort(order)] == [as_bytes(g) for g in forwards]
 
 
-def test_samples_stand_for_all_matches() -> None:
+def test_samples_give_nearly_as_many_inliers_as_all_matches() -> None:
     keypoints, pairs, matches = prepare(make_scene(num_points=6000), outliers=0.2)
     for g, h in zip(
         verify_pairs(keypoints, pairs, matches, KNOWN, VerifyOptions(max_samples=150)),
@@ -207,7 +207,7 @@ def test_samples_stand_for_all_matches() -> None:
         assert len(g.inlier_matches) >= 0.95 * len(h.inlier_matches)
 
 
-def test_distortion_is_undone() -> None:
+def test_distortion_is_corrected() -> None:
     scene = make_scene(noise=0.1)
     camera = make_camera(
         CameraOptions("SIMPLE_RADIAL", CAMERA_PARAMS.removesuffix("0") + "0.3"), WIDTH, HEIGHT
@@ -221,7 +221,7 @@ def test_distortion_is_undone() -> None:
     assert np.mean([g.config == TwoViewConfig.CALIBRATED for g in geometries]) > 0.9
 
 
-def test_hopeless_pairs_are_degenerate() -> None:
+def test_random_or_few_matches_are_degenerate() -> None:
     rng = np.random.default_rng(0)
     n = 60
     track = np.arange(n)
@@ -241,7 +241,7 @@ def test_hopeless_pairs_are_degenerate() -> None:
             assert geometry.F is None
 
 
-def test_standing_still_is_panoramic() -> None:
+def test_still_camera_is_panoramic() -> None:
     xy = np.random.default_rng(0).uniform(0, [WIDTH, HEIGHT], (200, 2)).astype(np.float32)
     images = [ImageKeypoints(i, xy, np.arange(200)) for i in range(2)]
     matches = np.repeat(np.arange(200, dtype=np.uint32)[:, None], 2, axis=1)
@@ -261,8 +261,8 @@ def test_points_on_a_line_are_planar(camera: pycolmap.Camera) -> None:
 
 
 @pytest.mark.shared
-@pytest.mark.skipif(not SHELFBOX.is_dir(), reason="no ../shared/sequences beside the checkout")
-def test_same_decisions_as_colmap_on_real_images() -> None:
+@pytest.mark.skipif(not SHELFBOX.is_dir(), reason="no ../shared/sequences next to the checkout")
+def test_configurations_agree_with_colmap_on_real_images() -> None:
     frames = sorted(SHELFBOX.iterdir())[:20:2]
     images = [cv2.imread(str(frame), cv2.IMREAD_GRAYSCALE) for frame in frames]
     height, width = images[0].shape
@@ -283,8 +283,8 @@ def test_same_decisions_as_colmap_on_real_images() -> None:
     camera = make_camera(CameraOptions(), width, height)
     ours = verify_pairs(keypoints, pairs, matches, camera)
     same, overlap = agreement_with_colmap(keypoints, pairs, matches, camera, ours)
-    # Pairs of neighbours lie near COLMAP's 0.8 between homography and fundamental matrix:
-    # COLMAP with another seed agrees with itself on 95 % of such pairs.
+    # Neighbouring images are near COLMAP's threshold of 0.8 between homography and fundamental
+    # matrix: COLMAP with another seed agrees with itself on 95 % of such pairs.
     assert np.mean(same) >= 0.9
     assert np.median(overlap) >= 0.95
 
