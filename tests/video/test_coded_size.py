@@ -47,7 +47,7 @@ sides = st.integers(16, 8192)
 
 
 @given(sides, sides, st.floats(1, 16))
-def test_coded_pictures_keep_their_shape(width: int, height: int, downscale: float) -> None:
+def test_coded_size_keeps_the_aspect_ratio(width: int, height: int, downscale: float) -> None:
     options = EncodeOptions(downscale=downscale)
     coded = coded_size((width, height), options)
     if downscale == 1:
@@ -70,16 +70,16 @@ def test_only_large_pictures_are_downscaled(width: int, height: int) -> None:
     assert with_downscale(EncodeOptions(downscale=3), (width, height)).downscale == 3
 
 
-def test_usual_sizes() -> None:
+def test_downscale_of_usual_sizes() -> None:
     sizes = [(1280, 720), (1080, 1920), (2704, 1520), (3840, 2160)]
     assert [with_downscale(EncodeOptions(), size).downscale for size in sizes] == [1, 2, 2, 4]
 
 
 @pytest.mark.parametrize(("size", "downscale"), [((322, 242), 2.0), ((333, 251), 3.0)])
-def test_coded_pictures_lie_where_the_full_ones_do(
+def test_downscaled_pictures_are_aligned_with_full_ones(
     encode: Encode, tmp_path: Path, size: tuple[int, int], downscale: float
 ) -> None:
-    """Corner on corner: half a pixel off would shift every keypoint."""
+    """The corners coincide: an offset of half a pixel would shift every keypoint."""
     rng = np.random.default_rng(1)
     noise = cv2.GaussianBlur(rng.standard_normal((size[1], size[0], 3)), (0, 0), 3 * downscale)
     picture = np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8)
@@ -103,7 +103,7 @@ def test_coded_pictures_lie_where_the_full_ones_do(
     assert np.abs(shift).max() < 0.02
 
 
-def test_keypoints_and_images_have_the_video_s_size(courtyard: Path, tmp_path: Path) -> None:
+def test_keypoints_and_images_have_the_size_of_the_video(courtyard: Path, tmp_path: Path) -> None:
     options = MatchOptions(
         encode=EncodeOptions("libaom", downscale=2), keep_stream=tmp_path / "stream.mp4"
     )
@@ -126,11 +126,11 @@ def test_keypoints_and_images_have_the_video_s_size(courtyard: Path, tmp_path: P
     truth, visible = render_scene.transfer(scene, xy[0][matches[:, 0]], 0, 4)
     error = np.linalg.norm(truth - xy[4][matches[:, 1]], axis=1)[visible]
     assert len(error) > 200
-    # Corrected in the full pictures: from the motion of small ones alone it is twice that.
+    # Refined in full pictures: with motion of the downscaled ones only, the error is twice that.
     assert np.median(error) < 0.25
 
 
-def test_folder_of_a_downscaled_video_has_its_size(courtyard: Path, tmp_path: Path) -> None:
+def test_model_of_a_downscaled_video_has_full_size(courtyard: Path, tmp_path: Path) -> None:
     encode = EncodeOptions("libaom", downscale=2)
     camera = CameraOptions(camera_model="PINHOLE", camera_params="520,520,320,180")
     match_options = MatchOptions(encode=encode, camera=camera)
@@ -161,7 +161,7 @@ def test_folder_of_a_downscaled_video_has_its_size(courtyard: Path, tmp_path: Pa
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.02 * extent
 
 
-def test_sigma_is_of_the_video_s_pixels(courtyard: Path, tmp_path: Path) -> None:
+def test_sigma_is_in_pixels_of_the_video(courtyard: Path, tmp_path: Path) -> None:
     found = {}
     for downscale in (1, 2):
         options = MatchOptions(
@@ -179,7 +179,7 @@ def test_sigma_is_of_the_video_s_pixels(courtyard: Path, tmp_path: Path) -> None
     assert 1.3 < ratio < 3
 
 
-def test_kept_stream_of_another_size_is_made_again(courtyard: Path, tmp_path: Path) -> None:
+def test_kept_stream_of_another_size_is_encoded_again(courtyard: Path, tmp_path: Path) -> None:
     stream = tmp_path / "stream.mp4"
     half = EncodeOptions("libaom", downscale=2)
     assert not stream_of(courtyard, stream, options=half).reused
@@ -189,9 +189,7 @@ def test_kept_stream_of_another_size_is_made_again(courtyard: Path, tmp_path: Pa
     assert stream_of(courtyard, stream, options=EncodeOptions("libaom", downscale=1)).reused
 
 
-def test_turned_video_is_downscaled_as_players_show_it(
-    courtyard: Path, ffmpeg: Ffmpeg, tmp_path: Path
-) -> None:
+def test_rotated_video_is_downscaled(courtyard: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     turned = ffmpeg(
         *("-display_rotation", "90", "-i", courtyard, "-frames:v", "4"),
         *("-c", "copy", tmp_path / "turned.mp4"),
@@ -212,7 +210,7 @@ def test_turned_video_is_downscaled_as_players_show_it(
     assert xy[:, 0].max() <= 360
 
 
-def test_large_pictures_are_downscaled_where_only_motion_is_wanted(
+def test_large_pictures_are_downscaled_if_only_motion_is_needed(
     encode: Encode, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(2)
@@ -237,7 +235,7 @@ def test_large_pictures_are_downscaled_where_only_motion_is_wanted(
         matches = opened.read_matches(ids[0], ids[1])
     moved = xy[1][matches[:, 1]] - xy[0][matches[:, 0]]
     np.testing.assert_allclose(np.median(moved, axis=0), [-8, 0], atol=0.1)
-    # What converts and does no more keeps the size: its output is a video of its own.
+    # The encode command keeps the size, because its output is a video in its own right.
     assert main(["encode", "--video", str(video), "--output", str(tmp_path / "out.mp4")]) == 0
     assert read_video(tmp_path / "out.mp4").picture_size == (1920, 1080)
 
@@ -245,7 +243,7 @@ def test_large_pictures_are_downscaled_where_only_motion_is_wanted(
 def test_stream_of_another_size_is_refused(
     courtyard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As of encoders that pad pictures to whole blocks."""
+    """Some encoders pad pictures to whole blocks."""
     monkeypatch.setattr("colmap_av1.video.encode.scaling", lambda options: ["scale=336:192"])
     options = MatchOptions(encode=EncodeOptions("libaom", downscale=2))
     with pytest.raises(VideoError, match="336x192"):

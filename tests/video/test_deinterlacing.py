@@ -36,7 +36,7 @@ def camcorder(
     ffmpeg: Ffmpeg,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Path:
-    """H.264 in a transport stream, two moments to a picture, the upper or lower lines first."""
+    """Interlaced H.264 in a transport stream, with the top or bottom field first."""
     folder = tmp_path_factory.mktemp("camcorder")
     single = encode(moments, folder / "single.mkv", "-c:v", "ffv1")
     first = {"top": ("tff=1", "interleave_top"), "bottom": ("bff=1", "interleave_bottom")}
@@ -48,13 +48,13 @@ def camcorder(
 
 
 def nearest(pictures: Sequence[NDArray[np.uint8]], moments: NDArray[np.uint8]) -> list[int]:
-    """The moment that each picture is most like."""
+    """The index of the most similar moment for each picture."""
     return [
         int(np.argmax([cv2.PSNR(picture, moment) for moment in moments])) for picture in pictures
     ]
 
 
-def test_pictures_are_of_their_first_field(camcorder: Path, moments: NDArray[np.uint8]) -> None:
+def test_decoded_pictures_show_the_first_field(camcorder: Path, moments: NDArray[np.uint8]) -> None:
     assert read_video(camcorder).is_interlaced
     pictures = dict(decode_frames(camcorder))
     assert list(pictures) == list(range(COUNT))
@@ -65,7 +65,7 @@ def test_pictures_are_of_their_first_field(camcorder: Path, moments: NDArray[np.
         np.testing.assert_array_equal(picture, pictures[index])
 
 
-def test_motion_is_of_the_same_moments(
+def test_converted_stream_shows_the_same_moments(
     camcorder: Path, moments: NDArray[np.uint8], tmp_path: Path
 ) -> None:
     report = encode_video(camcorder, tmp_path / "out.mp4", options=EncodeOptions(quality=5))
@@ -81,7 +81,7 @@ def test_motion_is_of_the_same_moments(
     assert found.conversion.endswith(", deinterlaced")
 
 
-def test_pictures_before_a_damage_are_given(camcorder: Path) -> None:
+def test_pictures_before_damage_are_deinterlaced(camcorder: Path) -> None:
     def damaged() -> Generator[Any, None, None]:
         yield from itertools.islice(decode(camcorder, 0, 1), 6)
         raise BitstreamError("damaged")
@@ -92,7 +92,7 @@ def test_pictures_before_a_damage_are_given(camcorder: Path) -> None:
         next(frames)
 
 
-def test_pictures_of_one_moment_stay(
+def test_progressive_video_is_unchanged(
     moments: NDArray[np.uint8], encode: Encode, tmp_path: Path
 ) -> None:
     video = encode(moments[:6], tmp_path / "plain.mkv", "-c:v", "ffv1", "-g", "1")

@@ -15,7 +15,7 @@ from colmap_av1.video.facts import frame_times, read_video, with_counted_packets
 from colmap_av1.video.unchanged import check_unchanged
 
 
-def test_what_was_read_is_not_read_again(clip: Path, tmp_path: Path) -> None:
+def test_facts_are_read_once(clip: Path, tmp_path: Path) -> None:
     video = tmp_path / "v.mp4"
     video.write_bytes(clip.read_bytes())
     read, file = read_video(video), read_file(video)
@@ -27,7 +27,7 @@ def test_what_was_read_is_not_read_again(clip: Path, tmp_path: Path) -> None:
         read_video(file)  # which has no picture
 
 
-def test_a_video_stands_for_its_path(clip: Path) -> None:
+def test_video_can_be_used_as_a_path(clip: Path) -> None:
     video = read_video(clip)
     assert Path(video) == clip
     assert str(video) == str(clip)
@@ -37,12 +37,14 @@ def test_a_video_stands_for_its_path(clip: Path) -> None:
     assert times.tolist() == [p.pts for p in packets(video)]
 
 
-@pytest.mark.parametrize("said", [0, 1, 0xFFFFFFF0])
-def test_a_container_that_lies_about_its_duration(clip: Path, tmp_path: Path, said: int) -> None:
+@pytest.mark.parametrize("duration", [0, 1, 0xFFFFFFF0])
+def test_wrong_duration_in_the_container_does_not_matter(
+    clip: Path, tmp_path: Path, duration: int
+) -> None:
     data = bytearray(clip.read_bytes())
     for box in (b"mvhd", b"mdhd", b"tkhd"):
         at = data.index(box) + 4 + (20 if box == b"tkhd" else 16)  # ISO/IEC 14496-12, version 0
-        data[at : at + 4] = said.to_bytes(4, "big")
+        data[at : at + 4] = duration.to_bytes(4, "big")
     path = tmp_path / "lies.mp4"
     path.write_bytes(data)
     true, lies = (frame_times(read_video(own)) for own in (clip, path))
@@ -53,18 +55,18 @@ def test_a_container_that_lies_about_its_duration(clip: Path, tmp_path: Path, sa
 
 
 def with_long(path: Path, data: bytes, box: bytes, offset: int, value: int) -> Path:
-    """Write a file in which the number of 4 bytes at an offset in a box's content is another."""
+    """Write a file with another 4-byte number at an offset in the content of a box."""
     at = data.index(box) + 4 + offset
     path.write_bytes(data[:at] + value.to_bytes(4, "big") + data[at + 4 :])
     return path
 
 
 @pytest.mark.parametrize("scale", [0, 0xFFFFFFFF])
-def test_a_container_whose_time_scale_cannot_be(clip: Path, tmp_path: Path, scale: int) -> None:
+def test_invalid_time_scale_is_reported(clip: Path, tmp_path: Path, scale: int) -> None:
     path = with_long(tmp_path / "lies.mp4", clip.read_bytes(), b"mdhd", 12, scale)
     with pytest.warns(UserWarning, match="time scale"):
-        told = read_info(path)
-    assert (told.num_shown, told.num_cut, told.frame_rate) == (16, 0, None)
+        info = read_info(path)
+    assert (info.num_shown, info.num_cut, info.frame_rate) == (16, 0, None)
     assert frame_times(read_video(path)) is None
     true, lies = match(tmp_path / "a.db", clip), match(tmp_path / "b.db", path)
     assert (lies.num_frames, lies.num_matches) == (true.num_frames, true.num_matches)
@@ -80,21 +82,21 @@ def test_a_container_whose_time_scale_cannot_be(clip: Path, tmp_path: Path, scal
 
 
 @pytest.mark.parametrize(("offset", "value"), [(8, 0), (12, 0x7FFFFF00)])
-def test_an_edit_list_that_shows_nothing(
+def test_edit_list_that_shows_no_frame_is_ignored(
     clip: Path, tmp_path: Path, offset: int, value: int
 ) -> None:
-    """Of no length, or from a time on at which the video is over."""
+    """The edit has no duration, or starts after the end of the video."""
     path = with_long(tmp_path / "lies.mp4", clip.read_bytes(), b"elst", offset, value)
     with pytest.warns(UserWarning, match="edit list"):
-        told = read_info(path)
-    assert (told.num_shown, told.num_cut, told.frame_rate) == (16, 0, 25.0)
+        info = read_info(path)
+    assert (info.num_shown, info.num_cut, info.frame_rate) == (16, 0, 25.0)
     true, lies = match(tmp_path / "a.db", clip), match(tmp_path / "b.db", path)
     assert (lies.num_frames, lies.num_matches) == (true.num_frames, true.num_matches)
     assert read_video(path).doubtful_times in lies.warnings
 
 
 @pytest.mark.parametrize("box", [b"stco", b"stsz"])
-def test_a_sample_table_that_points_elsewhere(clip: Path, tmp_path: Path, box: bytes) -> None:
+def test_invalid_sample_table_is_an_error(clip: Path, tmp_path: Path, box: bytes) -> None:
     path = with_long(tmp_path / "lies.mp4", clip.read_bytes(), box, 8 if box == b"stco" else 12, 0)
     with pytest.raises(BitstreamError, match=r"lies\.mp4"):
         read_info(path)
@@ -104,7 +106,7 @@ def test_a_sample_table_that_points_elsewhere(clip: Path, tmp_path: Path, box: b
 
 
 @pytest.mark.parametrize("rate", ["0.025", "100000"])
-def test_a_container_that_lies_about_its_rate(
+def test_implausible_frame_rate_does_not_matter(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, rate: str
 ) -> None:
     scale = str(25 / float(rate))
@@ -114,7 +116,7 @@ def test_a_container_that_lies_about_its_rate(
     assert (lies.num_frames, lies.num_matches) == (true.num_frames, true.num_matches)
 
 
-def test_a_video_is_as_it_was_when_opened(clip: Path, tmp_path: Path) -> None:
+def test_change_after_opening_is_detected(clip: Path, tmp_path: Path) -> None:
     path = tmp_path / "v.mp4"
     path.write_bytes(clip.read_bytes())
     video = read_video(path)
@@ -125,7 +127,7 @@ def test_a_video_is_as_it_was_when_opened(clip: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ["mp4", "mkv", "ivf", "obu"])
-def test_packets_are_counted_where_the_container_does_not(
+def test_packets_are_counted_if_the_container_gives_no_number(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, ending: str
 ) -> None:
     file = read_file(ffmpeg("-i", clip, "-c", "copy", tmp_path / f"v.{ending}"))
@@ -136,7 +138,7 @@ def test_packets_are_counted_where_the_container_does_not(
     assert with_counted_packets(counted) is counted
 
 
-def test_a_container_without_a_picture(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_container_without_a_decodable_picture(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     whole = ffmpeg("-i", clip, "-c", "copy", "-movflags", "+faststart", tmp_path / "whole.mp4")
     head, mdat, data = whole.read_bytes().partition(b"mdat")
     hurt = tmp_path / "hurt.mp4"

@@ -1,4 +1,4 @@
-"""Pictures that are kept are those that were decoded, and decoded once."""
+"""Kept pictures are identical to the decoded ones and are decoded only once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SCENE = Path(__file__).resolve().parents[2] / "examples" / "scene.mp4"
 
 
 class Video:
-    """Gives pictures as a decoder does, and remembers which."""
+    """Yields pictures like a decoder and records which were decoded."""
 
     def __init__(self, pictures: np.ndarray | list[np.ndarray] = NOISE) -> None:
         self.pictures = pictures
@@ -36,7 +36,7 @@ class Video:
 
 
 def taken(kept: KeptPictures, video: Video, wanted: list[int], most: int | None = None):
-    """The pictures of frames, up to the last or to so many, as those who stop there take them."""
+    """Take at most `most` pictures and stop after the last, as callers do."""
     found = {}
     pictures = kept.of(wanted, video.frames(wanted))
     for frame, picture in pictures:
@@ -48,7 +48,7 @@ def taken(kept: KeptPictures, video: Video, wanted: list[int], most: int | None 
 
 
 @given(st.sets(st.integers(0, 59), min_size=1, max_size=8), st.data())
-def test_pictures_are_those_that_were_decoded(
+def test_kept_pictures_equal_the_decoded_ones(
     tmp_path_factory: pytest.TempPathFactory, wanted: set[int], data: st.DataObject
 ) -> None:
     kept = KeptPictures(tmp_path_factory.mktemp("kept") / "pictures.raw")
@@ -60,7 +60,7 @@ def test_pictures_are_those_that_were_decoded(
         assert all(np.array_equal(picture, NOISE[frame]) for frame, picture in found.items())
 
 
-def test_what_is_kept_is_not_decoded_again(tmp_path: Path) -> None:
+def test_kept_pictures_are_not_decoded_again(tmp_path: Path) -> None:
     kept, video = KeptPictures(tmp_path / "pictures.raw"), Video()
     taken(kept, video, WANTED)
     assert video.decoded == list(range(40))
@@ -71,14 +71,14 @@ def test_what_is_kept_is_not_decoded_again(tmp_path: Path) -> None:
     assert video.decoded == [*range(40), *range(42)]
 
 
-def test_pictures_that_were_not_all_taken_are_decoded_again(tmp_path: Path) -> None:
+def test_pictures_are_decoded_again_if_not_all_were_taken(tmp_path: Path) -> None:
     kept, video = KeptPictures(tmp_path / "pictures.raw"), Video()
     taken(kept, video, WANTED, most=2)
     assert len(taken(kept, video, WANTED)) == 4
     assert video.decoded == [*range(9), *range(40)]
 
 
-def test_what_a_damaged_video_lacks_is_asked_for_again(tmp_path: Path) -> None:
+def test_missing_pictures_of_a_damaged_video_are_requested_again(tmp_path: Path) -> None:
     class Damaged(Video):
         def frames(self, wanted: list[int]) -> Iterator[tuple[int, av.VideoFrame]]:
             yield from Video(self.pictures[:10]).frames(wanted)
@@ -91,7 +91,7 @@ def test_what_a_damaged_video_lacks_is_asked_for_again(tmp_path: Path) -> None:
     assert len(taken(kept, Video(NOISE[:20]), WANTED)) == 3
 
 
-def test_pictures_of_another_size_are_passed_on(tmp_path: Path) -> None:
+def test_pictures_of_another_size_are_passed_through(tmp_path: Path) -> None:
     kept = KeptPictures(tmp_path / "pictures.raw")
     pictures = [*NOISE[:16], *np.zeros((44, 8, 8, 3), np.uint8)]
     for _ in range(2):
@@ -99,8 +99,8 @@ def test_pictures_of_another_size_are_passed_on(tmp_path: Path) -> None:
         assert [found[frame].shape[:2] for frame in WANTED] == [(7, 11), (7, 11), (8, 8), (8, 8)]
 
 
-# As cameras store pictures: 8 bits, what phones call HDR, whose samples of colour lie beside those
-# of brightness, all of JPEG's range, and colours that need no conversion.
+# Pixel formats of cameras: 8 bits, HDR of phones with 10 bits, the full range of JPEG, a palette,
+# and RGB, which needs no conversion.
 KINDS = {
     "plain": ["-c:v", "libx264", "-pix_fmt", "yuv420p"],
     "odd": ["-vf", "crop=317:179:exact=1", "-c:v", "libx264", "-pix_fmt", "yuv444p"],
@@ -112,7 +112,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_real_pictures_are_kept_exactly(tmp_path: Path, ffmpeg: Ffmpeg, kind: str) -> None:
+def test_all_pixel_formats_are_kept_exactly(tmp_path: Path, ffmpeg: Ffmpeg, kind: str) -> None:
     video, wanted = tmp_path / "video.nut", [0, 3, 7]
     ffmpeg("-i", SCENE, "-frames:v", "8", *KINDS[kind], video)
     kept = KeptPictures(tmp_path / "pictures.raw")
@@ -125,7 +125,7 @@ def test_real_pictures_are_kept_exactly(tmp_path: Path, ffmpeg: Ffmpeg, kind: st
         assert np.array_equal(picture, again[frame])
 
 
-def test_no_time_goes_into_decoding_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kept_pictures_need_no_decoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = KeptPictures(tmp_path / "pictures.raw")
     assert [frame for frame, _ in decode_frames(SCENE, wanted=WANTED, kept=kept)] == WANTED
     monkeypatch.setattr("colmap_av1.video.decoding.decode", lambda *_: pytest.fail("decoded"))
@@ -133,7 +133,7 @@ def test_no_time_goes_into_decoding_again(tmp_path: Path, monkeypatch: pytest.Mo
     assert [frame for frame, _ in again] == WANTED[1:3]
 
 
-def test_none_are_given_where_none_are_wanted(tmp_path: Path) -> None:
+def test_no_pictures_are_given_if_none_are_wanted(tmp_path: Path) -> None:
     kept = KeptPictures(tmp_path / "pictures.raw")
     for _ in range(2):
         assert list(decode_frames(SCENE, wanted=[], kept=kept)) == []

@@ -1,4 +1,4 @@
-"""Positions in containers, as phones, GoPro's cameras and DJI's drones write them."""
+"""Positions in metadata of phones, GoPro cameras and DJI drones."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def positions_of(path: Path) -> Positions:
         ),
     ],
 )
-def test_one_position_of_a_phone(
+def test_position_of_a_phone_is_read(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, words: list[str], place: tuple[float, ...]
 ) -> None:
     found = positions_of(ffmpeg("-i", clip, "-c", "copy", *words, tmp_path / "phone.mp4"))
@@ -51,16 +51,18 @@ def test_one_position_of_a_phone(
     assert len(found.times) == 0
 
 
-@pytest.mark.parametrize("said", ["+00.0000+000.0000/", "+95.0000+018.0686/", "at home", ""])
-def test_no_position_that_can_be_one(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, said: str) -> None:
+@pytest.mark.parametrize("value", ["+00.0000+000.0000/", "+95.0000+018.0686/", "at home", ""])
+def test_invalid_position_of_a_phone_is_ignored(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, value: str
+) -> None:
     words = ["-movflags", "use_metadata_tags", "-metadata"]
-    words.append(f"com.apple.quicktime.location.ISO6709={said}")
+    words.append(f"com.apple.quicktime.location.ISO6709={value}")
     path = ffmpeg("-i", clip, "-c", "copy", *words, tmp_path / "phone.mp4")
     assert read_positions(read_file(path)) is None
 
 
 @pytest.mark.parametrize(
-    ("said", "why"),
+    ("value", "message"),
     [
         ("+95.0000+218.0686/", "+95.0000+218.0686/"),
         ("+00.0000+000.0000/", "Earth"),
@@ -69,30 +71,30 @@ def test_no_position_that_can_be_one(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path,
         ("", None),
     ],
 )
-def test_a_place_that_is_none_is_told(said: str, why: str | None) -> None:
-    warning = implausible_position((("com.apple.quicktime.location.iso6709", said),))
-    if why is None:
+def test_invalid_position_of_a_phone_is_reported(value: str, message: str | None) -> None:
+    warning = implausible_position((("com.apple.quicktime.location.iso6709", value),))
+    if message is None:
         assert warning is None
         return
     assert warning is not None
-    assert why in warning
+    assert message in warning
     assert warning.isprintable()
     assert len(warning) < 140
 
 
-def test_positions_of_a_path_that_are_none_are_told(clip: Path, tmp_path: Path) -> None:
+def test_invalid_positions_of_a_path_are_reported(clip: Path, tmp_path: Path) -> None:
     wrong, no_fix = PLACES + np.array([40.0, 0, 0]), PLACES * [0, 0, 1]
     payload = gps5(PLACES)
     video = tmp_path / "DJI_0001.mp4"
     shutil.copyfile(clip, video)
-    beside = video.with_suffix(".srt")
+    srt = video.with_suffix(".srt")
 
     def of_gopro(body: bytes) -> tuple[int, str | None]:
         found = read_positions(read_file(with_gpmf(clip, tmp_path / "gopro.mp4", [(0.6, body)])))
         return (len(found.times), found.left_out) if found is not None else (0, None)
 
     def of_drone(text: str) -> tuple[int, str | None]:
-        beside.write_text(text)
+        srt.write_text(text)
         found = read_positions(read_file(video))
         return (len(found.times), found.left_out) if found is not None else (0, None)
 
@@ -117,26 +119,28 @@ def test_positions_of_a_path_that_are_none_are_told(clip: Path, tmp_path: Path) 
         assert count == 0
         assert warning is not None
         assert warning.endswith("has no positions in a known format")
-    # As cameras leave it that were switched off, and what is no .srt file.
+    # An empty file, as left by cameras that were switched off, and a file that is not a .srt file.
     for text in ("", "no subtitles"):
-        beside.write_text(text)
+        srt.write_text(text)
         count, warning = of_drone(text)
-        assert warning == f"{beside} has no positions in a known format"
-    # Without a fix, and subtitles of another kind.
+        assert warning == f"{srt} has no positions in a known format"
+    # No GPS fix, and ordinary subtitles.
     assert of_drone(dji_text(no_fix, 25)) == (0, None)
     assert of_drone(f"{stamp}Hello there\n\n") == (0, None)
 
 
-def test_subtitles_beside_a_video_and_in_it(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_positions_are_read_from_srt_files_and_subtitle_streams(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
     video = tmp_path / "DJI_0001.mp4"
     shutil.copyfile(clip, video)
-    beside = tmp_path / "DJI_0001.SRT"
-    beside.write_text(dji_text(PLACES, 25))
+    srt = tmp_path / "DJI_0001.SRT"
+    srt.write_text(dji_text(PLACES, 25))
     inside = ffmpeg(
-        *("-i", clip, "-i", beside, "-map", "0:v", "-map", "1", "-c:v", "copy"),
+        *("-i", clip, "-i", srt, "-map", "0:v", "-map", "1", "-c:v", "copy"),
         *("-c:s", "mov_text", tmp_path / "inside.mp4"),
     )
-    for path, source in ((video, str(beside)), (inside, f"the subtitles of {inside}")):
+    for path, source in ((video, str(srt)), (inside, f"the subtitles of {inside}")):
         found = positions_of(path)
         assert found.source == source
         np.testing.assert_allclose(found.times, np.arange(10) / 25, atol=1e-3)
@@ -160,7 +164,7 @@ def test_subtitles_beside_a_video_and_in_it(clip: Path, ffmpeg: Ffmpeg, tmp_path
         # Latitude first, then the accuracy: Matrice 300, also east and south.
         ("GPS(40.0001,-3.0001,0.0M) BAROMETER:1.5M", (40.0001, -3.0001, 1.5)),
         ("GPS(-41.3899,174.0177,0.0M) BAROMETER:97.7M", (-41.3899, 174.0177, 97.7)),
-        # Named: Mavic 2, Mavic 3, Air 2S; Autel.
+        # With names: Mavic 2, Mavic 3, Air 2S; Autel.
         ("[latitude : -20.2533] [longtitude : 149.0251] [ev: 0]", (-20.2533, 149.0251, 0)),
         (
             "[latitude: 59.3023] [longitude: 18.2030] [rel_alt: 1.300 abs_alt: 132.860]",
@@ -169,14 +173,14 @@ def test_subtitles_beside_a_video_and_in_it(clip: Path, ffmpeg: Ffmpeg, tmp_path
         ("[latitude: 41.4247] [longitude: 2.2341] [altitude: 117.0]", (41.4247, 2.2341, 117)),
         ("GPS(W: 8.6499, N: 53.1665, 12.5m)", (53.1665, -8.6499, 12.5)),
         ("GPS(E:8.6499,S:53.1665,-2m)", (-53.1665, 8.6499, -2)),
-        # No known spelling: only one order is on Earth.
+        # Unknown format: only one order gives a valid position.
         ("GPS(149.0251,-20.2533,16.5)", (-20.2533, 149.0251, 16.5)),
         ("GPS(-20.2533,149.0251)", (-20.2533, 149.0251, 0)),
-        # A known spelling against the range.
+        # Known format, decided by the valid range.
         ("GPS(120.5001,57.0002,0.5M) BAROMETER(12.5)", (57.0002, 120.5001, 12.5)),
     ],
 )
-def test_spellings_of_drones(clip: Path, tmp_path: Path, text: str, place: object) -> None:
+def test_position_formats_of_drones(clip: Path, tmp_path: Path, text: str, place: object) -> None:
     found = positions_of(with_srt(clip, tmp_path, text))
     np.testing.assert_allclose(found.places, [place])
     assert found.left_out is None
@@ -189,10 +193,10 @@ def test_spellings_of_drones(clip: Path, tmp_path: Path, text: str, place: objec
         ("GPS(40.0001,-3.0001,12.5m)", "-03.0100+040.0100/", (-3.0001, 40.0001, 12.5)),
         ("GPS(40.0001,-3.0001,12.5m)", "+52.0000+013.0000/", None),
         ("GPS(40.0001,-3.0001,12.5m)", None, None),
-        # The video's own tag contradicts the order that the spelling has elsewhere.
+        # The location tag of the video contradicts the usual order of this format.
         ("GPS(40.0001,-3.0001,0.0M)", "-03.0100+040.0100/", (-3.0001, 40.0001, 0)),
         ("GPS(40.0001,-3.0001,12)", "+40.0100-003.0100/", (40.0001, -3.0001, 0)),
-        # Radians, as of some Mavic Air 2.
+        # Radians, as written by some Mavic Air 2.
         (
             "[latitude : 0.698134] [longtitude : -0.052361]",
             "+40.0100-003.0100/",
@@ -201,7 +205,7 @@ def test_spellings_of_drones(clip: Path, tmp_path: Path, text: str, place: objec
         ("[latitude : 0.698134] [longtitude : -0.052361]", None, None),
     ],
 )
-def test_the_location_of_the_video_tells_the_order(
+def test_location_tag_of_the_video_decides_the_order(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, *, text: str, tag: str | None, place: object
 ) -> None:
     words = [] if tag is None else ["-metadata", f"location={tag}"]
@@ -216,17 +220,17 @@ def test_the_location_of_the_video_tells_the_order(
         assert found.left_out is None
 
 
-def test_subtitles_that_start_late(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
-    """The first one of a Mavic Pro starts at 1 s."""
+def test_subtitles_may_start_after_the_video(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """The first subtitle of a Mavic Pro starts at 1 s."""
     cues = "".join(
         f"{k}\n00:00:0{k},000 --> 00:00:0{k + 1},000\nGPS(149.025{k},-20.2533,16)\n\n"
         for k in range(1, 5)
     )
     video = with_srt(clip, tmp_path, "")
-    beside = video.with_suffix(".srt")
-    beside.write_text(cues)
+    srt = video.with_suffix(".srt")
+    srt.write_text(cues)
     inside = ffmpeg(
-        *("-i", clip, "-i", beside, "-map", "0:v", "-map", "1", "-c:v", "copy"),
+        *("-i", clip, "-i", srt, "-map", "0:v", "-map", "1", "-c:v", "copy"),
         *("-c:s", "mov_text", tmp_path / "inside.mp4"),
     )
     for path in (video, inside):
@@ -236,14 +240,14 @@ def test_subtitles_that_start_late(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -
 
 
 def with_srt(clip: Path, folder: Path, text: str) -> Path:
-    """A copy of a video with a subtitle beside it, from its start to 1 s."""
+    """A copy of a video with a .srt file next to it that has one subtitle, from 0 to 1 s."""
     video = folder / "DJI_0001.mp4"
     shutil.copyfile(clip, video)
     video.with_suffix(".srt").write_text(f"1\n00:00:00,000 --> 00:00:01,000\n{text}\n\n")
     return video
 
 
-def test_track_of_a_gopro(clip: Path, tmp_path: Path) -> None:
+def test_path_of_a_gopro_is_read(clip: Path, tmp_path: Path) -> None:
     down = np.tile([0.0, 1.0, 0.0], (5, 1))
     payloads = [
         (0.4, gps5(PLACES[:4]) + grav(down)),
@@ -259,7 +263,7 @@ def test_track_of_a_gopro(clip: Path, tmp_path: Path) -> None:
 
 @given(st.data())
 @settings(max_examples=100, deadline=None)
-def test_damaged_telemetry_is_left_out(data: st.DataObject) -> None:
+def test_damaged_telemetry_raises_nothing(data: st.DataObject) -> None:
     whole = gpmf_nest(b"DEVC", gps5(PLACES), gps9(PLACES, [3] * 10), gpmf(b"SROT", "f", 15.2))
     body = bytearray(whole[: data.draw(st.integers(0, len(whole)))])
     for _ in range(data.draw(st.integers(0, 4)) if body else 0):
@@ -267,22 +271,22 @@ def test_damaged_telemetry_is_left_out(data: st.DataObject) -> None:
     read_payload(bytes(body))
 
 
-def test_images_lie_between_positions(clip: Path, tmp_path: Path) -> None:
-    """16 frames at 25 per second, positions at 10 per second from 0.1 s on for 0.3 s."""
+def test_positions_of_images_are_interpolated(clip: Path, tmp_path: Path) -> None:
+    """16 frames at 25 per second, and three positions at 10 per second from 0.1 s on."""
     payloads = [(0.1, gps5(PLACES[:1], fix=0)), (0.3, gps5(PLACES[1:4]))]
     video = read_video(with_gpmf(clip, tmp_path / "gopro.mp4", payloads))
     frames = np.arange(16, dtype=np.int32)
     image_set = count_through([""], [ChosenImages([f"{k}.png" for k in frames], frames)], [16])
     found = image_positions(image_set, [video], [])
     times = frames / 25
-    known = (times >= 0) & (times < 0.4)  # one position holds until the next would come
+    known = (times >= 0) & (times < 0.4)  # a position is valid until the next one is due
     assert np.isfinite(found.places).all(axis=1).tolist() == known.tolist()
     expected = np.interp(times[known], [0.1, 0.2, 0.3], PLACES[1:4, 1])
     np.testing.assert_allclose(found.places[known, 1], expected, atol=1e-7)
 
 
-def test_items_within_items_without_end() -> None:
-    # Each of 5,000 items holds all that follow.
+def test_deeply_nested_items_are_read() -> None:
+    # Each of 5,000 items contains all following ones.
     data = b"".join(b"DEVC\0\1" + (8 * rest).to_bytes(2, "big") for rest in range(4999, -1, -1))
     payload = read_payload(data)
     assert len(payload.positions) == len(payload.gravity) == 0

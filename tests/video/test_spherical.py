@@ -1,4 +1,4 @@
-"""Videos of all directions are refused with a line that cuts views from them."""
+"""Equirectangular videos are refused with a command that extracts perspective views."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/">
 
 
 def as_spherical(video: Path, output: Path) -> Path:
-    """The video, whose index is at its end, with the box at the end of its first track."""
+    """Add the box at the end of the first track; the index of the video must be at its end."""
     data = bytearray(video.read_bytes())
     box = struct.pack(">I4s", 24 + len(XML), b"uuid") + UUID + XML
     index = data.index(b"moov") - 4
@@ -41,14 +41,14 @@ def as_spherical(video: Path, output: Path) -> Path:
     return output
 
 
-def test_line_cuts_views(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_suggested_command_extracts_views(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     flat = encode(make_frames(4, 256, 128), tmp_path / "flat.mp4")
     video = as_spherical(flat, tmp_path / "all round.mp4")
     assert read_video(flat).projection is None
-    with pytest.raises(VideoError, match="equirectangular") as told:
+    with pytest.raises(VideoError, match="equirectangular") as error:
         match(tmp_path / "a.db", video)
     assert not (tmp_path / "a.db").exists()
-    line = str(told.value).split("--video: ")[1]
+    line = str(error.value).split("--video: ")[1]
     program = shlex.quote(imageio_ffmpeg.get_ffmpeg_exe())
     line = line.replace("do ffmpeg ", f"do {program} -v error ")
     subprocess.run(line, shell=True, check=True, cwd=tmp_path)
@@ -57,10 +57,10 @@ def test_line_cuts_views(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None
     assert {read_video(view).picture_size for view in views} == {(96, 96)}
 
 
-def test_shape_alone_is_a_hint() -> None:
+def test_aspect_ratio_gives_a_hint() -> None:
     video = Path("a.mp4")
-    (told,) = hint(video, None, (3840, 1920))
-    assert "equirectangular" in told
+    (message,) = hint(video, None, (3840, 1920))
+    assert "equirectangular" in message
     assert hint(video, None, (3840, 2160)) == []
     assert hint(video, None, (256, 128)) == []
     assert hint(video, 0, (3840, 1920)) == []

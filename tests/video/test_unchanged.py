@@ -23,7 +23,7 @@ def write_anew(video: Path) -> None:
 
 
 def point_elsewhere(video: Path) -> None:
-    """At a file of the same size and time."""
+    """Replace the video by a link to a file of the same size and time."""
     other = video.with_name("other")
     other.write_bytes(video.read_bytes())
     os.utime(other, ns=(video.stat().st_atime_ns, video.stat().st_mtime_ns))
@@ -37,14 +37,14 @@ def video(tmp_path: Path) -> Path:
     return tmp_path / "v.mp4"
 
 
-def test_what_stays_is_accepted(video: Path) -> None:
+def test_unchanged_video_is_accepted(video: Path) -> None:
     with unchanged(file_state(video)) as check:
         video.read_bytes()
         check()
 
 
 def read(video: Path, change: Callable[[Path], None], error: Exception | None = None) -> None:
-    """Read a video that changes; the error where its check notices."""
+    """Read a video that changes; raise `error` if the check notices."""
     with unchanged(file_state(video)) as check:
         change(video)
         try:
@@ -55,24 +55,24 @@ def read(video: Path, change: Callable[[Path], None], error: Exception | None = 
 
 
 @pytest.mark.parametrize("change", [write_on, write_anew, point_elsewhere, Path.unlink])
-def test_what_changes_is_refused(video: Path, change: Callable[[Path], None]) -> None:
+def test_changed_video_is_refused(video: Path, change: Callable[[Path], None]) -> None:
     with pytest.raises(VideoError, match="changed"):
         read(video, change)
 
 
-def test_what_changes_is_refused_at_once(video: Path) -> None:
-    with pytest.raises(ZeroDivisionError):  # which is no user's fault, and stays what it is
+def test_change_does_not_hide_internal_errors(video: Path) -> None:
+    with pytest.raises(ZeroDivisionError):  # an internal error is not replaced
         read(video, write_on, ZeroDivisionError())
 
 
-def test_errors_that_come_of_a_change_say_so(video: Path) -> None:
+def test_errors_after_a_change_name_the_change(video: Path) -> None:
     with pytest.raises(ImageError, match="own"), unchanged(file_state(video)):
         raise ImageError("of its own")
     with pytest.raises(VideoError, match="changed"):
         read(video, write_on, ImageError("no frame 7"))
 
 
-def test_a_video_that_was_never_there(tmp_path: Path) -> None:
+def test_missing_video_is_not_reported_as_changed(tmp_path: Path) -> None:
     none = file_state(tmp_path / "none.mp4")
     with pytest.raises(OptionError, match="no such file"), unchanged(none):
         raise OptionError("no such file")

@@ -44,7 +44,7 @@ def leb128(data: bytes, at: int) -> tuple[int, int]:
 
 
 def obus(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Type and payload of the OBUs of a packet (5.3.1), delimiters left out."""
+    """Type and payload of the OBUs of a packet (5.3.1), without delimiters."""
     at = 0
     while at < len(data):
         header = data[at]
@@ -67,7 +67,7 @@ def read_until_error(path: Path) -> tuple[list[bytes], Exception | None]:
 
 
 @pytest.mark.shared
-def test_every_container_of_a_stream_gives_the_same_obus() -> None:
+def test_all_containers_of_a_stream_give_the_same_obus() -> None:
     compared = 0
     for stream in manifest():
         kinds = [c for c in stream["containers"] if c["kind"] != "variant"]
@@ -82,7 +82,7 @@ def test_every_container_of_a_stream_gives_the_same_obus() -> None:
 
 
 @pytest.mark.shared
-def test_packets_of_ivf_are_the_bytes_of_the_file() -> None:
+def test_ivf_packets_are_the_bytes_of_the_file() -> None:
     path = KIT / "streams/good_lag0.ivf"
     data, at, expected = path.read_bytes(), 32, []
     while at < len(data):
@@ -138,14 +138,14 @@ def test_damage_is_reported_after_the_packets_before_it(
 
 
 @pytest.mark.shared
-def test_no_damaged_file_raises_anything_else() -> None:
+def test_damaged_files_only_raise_errors_of_the_package() -> None:
     for path in sorted((KIT / "bad").iterdir()):
         _, error = read_until_error(path)
         assert "\n" not in str(error)
 
 
 @pytest.mark.parametrize("ending", ["mp4", "mkv", "webm", "ivf", "obu"])
-def test_cut_files_give_a_prefix_and_are_reported(
+def test_truncated_files_give_a_prefix_and_are_reported(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, ending: str
 ) -> None:
     flags = ["-movflags", "+faststart"] if ending == "mp4" else []
@@ -173,10 +173,10 @@ def test_cut_files_give_a_prefix_and_are_reported(
         ("mp4", ["-movflags", "frag_every_frame+empty_moov"]),
     ],
 )
-def test_recordings_cut_inside_their_last_packet(
+def test_recordings_truncated_in_the_last_packet_are_reported(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, ending: str, how: list[str]
 ) -> None:
-    """Such files say neither their length nor the number of their packets."""
+    """Such files contain neither their duration nor the number of packets."""
     whole = ffmpeg("-i", clip, "-c", "copy", *how, tmp_path / f"whole.{ending}")
     expected = [p.data for p in packets(whole)]
     assert len(expected) == 16
@@ -199,7 +199,7 @@ def test_recordings_cut_inside_their_last_packet(
 
 @pytest.mark.skipif(not hasattr(av.Packet, "has_sidedata"), reason="PyAV shows no encryption")
 @pytest.mark.parametrize("codec", [AV1, ["-c:v", "libx264"]])
-def test_encrypted_videos_are_named_so(
+def test_encrypted_videos_are_reported_as_encrypted(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, codec: list[str]
 ) -> None:
     words = ["-encryption_scheme", "cenc-aes-ctr", "-encryption_key", "76" * 16]
@@ -216,7 +216,7 @@ def test_encrypted_videos_are_named_so(
     assert not (tmp_path / "out.mp4").exists()
 
 
-def test_what_follows_the_last_packet_is_not_cut(
+def test_data_after_the_last_packet_is_not_reported(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
 ) -> None:
     for ending in ("mkv", "mp4"):
@@ -252,7 +252,7 @@ def test_edit_lists_drop_no_packet(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Pat
 
 @pytest.mark.parametrize("angle", [0, 90, 180, 270])
 @pytest.mark.parametrize("codec", ["av1", "h264"])
-def test_pictures_are_turned_as_ffmpeg_turns_them(
+def test_pictures_are_rotated_like_ffmpeg(
     encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, angle: int, codec: str
 ) -> None:
     how = AV1 if codec == "av1" else ["-c:v", "libx264"]
@@ -271,7 +271,7 @@ def test_pictures_are_turned_as_ffmpeg_turns_them(
     for index, image in decoded:
         written = cv2.imread(str(tmp_path / f"{index + 1}.png"))
         assert image.shape == written.shape
-        # Players and PyAV may round differently on the way from YUV.
+        # FFmpeg and PyAV may round differently when converting from YUV.
         assert np.abs(image.astype(int) - written.astype(int)).mean() < 2
 
 
@@ -305,8 +305,8 @@ def test_frames_before_damage_are_decoded(name: str, count: int, num_threads: in
 
 
 @pytest.mark.shared
-def test_film_grain_is_off() -> None:
-    """The kit's checksums are of pictures without grain."""
+def test_film_grain_is_not_applied() -> None:
+    """The checksums of the conformance kit are of pictures without grain."""
     stream = next(s for s in manifest() if s["name"] == "film_grain_test")
     path = KIT / stream["containers"][0]["file"]
     grainless = hashlib.md5()
@@ -322,7 +322,9 @@ def test_film_grain_is_off() -> None:
         np.testing.assert_array_equal(image, picture.to_ndarray(format="bgr24"))
 
 
-def test_not_av1_says_the_command_that_converts(encode: Encode, tmp_path: Path) -> None:
+def test_error_for_other_codecs_gives_the_conversion_command(
+    encode: Encode, tmp_path: Path
+) -> None:
     source = encode(make_frames(3), tmp_path / "it's one.mp4", "-c:v", "libx264")
     with pytest.raises(NotAv1Error) as caught:
         open_stream(source)
@@ -332,14 +334,14 @@ def test_not_av1_says_the_command_that_converts(encode: Encode, tmp_path: Path) 
     assert len(list(packets(tmp_path / "it's one_av1.mp4"))) == 3
 
 
-def test_audio_only(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_audio_file_is_refused(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     tone = ffmpeg("-f", "lavfi", "-i", "sine=duration=0.2", tmp_path / "tone.mp4")
     with pytest.raises(VideoError, match="audio"):
         open_stream(tone)
 
 
 @pytest.mark.parametrize("ending", ["m4a", "mp3"])
-def test_audio_with_a_cover_picture(
+def test_audio_file_with_a_cover_picture_is_refused(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, ending: str
 ) -> None:
     cover = ffmpeg("-i", clip, "-frames:v", "1", tmp_path / "cover.png")
@@ -352,7 +354,7 @@ def test_audio_with_a_cover_picture(
             read(tone)
 
 
-def test_missing_folder_and_empty_file(tmp_path: Path) -> None:
+def test_missing_files_folders_and_empty_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(VideoError, match="no such file"):
         open_stream(tmp_path / "none.mp4")
     with pytest.raises(VideoError, match="is a folder"):
@@ -363,7 +365,7 @@ def test_missing_folder_and_empty_file(tmp_path: Path) -> None:
         open_stream(empty)
 
 
-def test_names_are_never_taken_for_protocols(
+def test_file_names_are_not_interpreted_as_protocols(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -399,8 +401,8 @@ def test_ivf_without_a_frame_rate_is_read(
 
 
 @pytest.mark.parametrize("is_count", [True, False])
-def test_ivf_in_units_of_time_finer_than_frames(clip: Path, tmp_path: Path, is_count: bool) -> None:
-    """The header holds the number of frames or the length in units of time."""
+def test_ivf_time_unit_may_be_finer_than_frames(clip: Path, tmp_path: Path, is_count: bool) -> None:
+    """The header contains the number of frames or the duration in time units."""
     data = bytearray(ivf_of(clip))
     fine = 12800 // 25
     struct.pack_into("<II", data, 16, 12800, 1)
@@ -416,16 +418,18 @@ def test_ivf_in_units_of_time_finer_than_frames(clip: Path, tmp_path: Path, is_c
         assert [p.pts for p in stream.packets()] == pytest.approx(np.arange(16) / 25)
 
 
-def test_pictures_that_are_shown_again_at_the_end_count(clip: Path, tmp_path: Path) -> None:
-    """Players show 4 coded pictures and then the first one of them 20 times more."""
+def test_repeated_pictures_at_the_end_are_counted(clip: Path, tmp_path: Path) -> None:
+    """Players show 4 coded pictures, and then the first of them 20 more times."""
     path = with_repeats(clip, tmp_path / "again.ivf", range(4), [(3, 0, 20)])
     assert len(list(decode_frames(path))) == 24
     report = read_info(path)
     assert (report.num_shown, report.num_coded) == (24, 4)
 
 
-def test_animated_avif_is_its_track(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
-    """Such a file holds a still picture, too, which comes first."""
+def test_animated_avif_is_read_from_its_track(
+    encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """Such a file also contains a still picture, which comes first."""
     clip = encode(make_frames(6), tmp_path / "clip.mp4", *AV1)
     moving = ffmpeg("-i", clip, "-c", "copy", tmp_path / "moving.avif")
     still = ffmpeg("-i", clip, "-frames:v", "1", "-c", "copy", tmp_path / "still.avif")
