@@ -1,4 +1,4 @@
-"""Images that are all blurred are reported."""
+"""A warning is given if all images are blurred."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ def sharp() -> list[NDArray[np.uint8]]:
     return [picture for index, picture in decode_frames(SCENE) if index < 12]
 
 
-def test_sharp_images_are_sharp_at_any_size(sharp: list[NDArray[np.uint8]], tmp_path: Path) -> None:
+def test_sharp_images_cause_no_warning_at_any_size(
+    sharp: list[NDArray[np.uint8]], tmp_path: Path
+) -> None:
     files = [tmp_path / "a.png", tmp_path / "b.png"]
     for scale in (0.5, 1.0, 4.0):
         for file, picture in zip(files, sharp, strict=False):
@@ -35,21 +37,21 @@ def test_sharp_images_are_sharp_at_any_size(sharp: list[NDArray[np.uint8]], tmp_
         assert blur_warning(files) is None
 
 
-def test_blurred_images_are_told(sharp: list[NDArray[np.uint8]], tmp_path: Path) -> None:
+def test_blurred_images_are_reported(sharp: list[NDArray[np.uint8]], tmp_path: Path) -> None:
     files = [tmp_path / f"{index}.png" for index in range(len(sharp))]
     for file, picture in zip(files, sharp, strict=True):
         cv2.imwrite(str(file), gaussian(picture))
     warning = blur_warning(files)
     assert warning is not None
     assert warning.startswith(f"{tmp_path}: the images are blurred")
-    # One that is blurred among sharp ones is nothing to tell.
+    # A single blurred image is not reported.
     for file, picture in zip(files[1:], sharp[1:], strict=True):
         cv2.imwrite(str(file), picture)
     assert blur_warning(files) is None
 
 
 def along_a_line(picture: NDArray[np.uint8], length: int, radians: float) -> NDArray[np.uint8]:
-    """The picture as of a camera that moves meanwhile, with a sensor's noise."""
+    """The picture with motion blur along a line and sensor noise."""
     half = length / 2
     ends = half + half * np.array([[-1], [1]]) * [np.cos(radians), np.sin(radians)]
     kernel = np.zeros((length + 1, length + 1), np.float32)
@@ -61,7 +63,7 @@ def along_a_line(picture: NDArray[np.uint8], length: int, radians: float) -> NDA
 
 @pytest.mark.parametrize("length", [25, 80])
 @pytest.mark.parametrize("radians", [0.0, 0.4, np.pi / 2, 2.0])
-def test_motion_blur_is_told(
+def test_motion_blur_is_reported(
     sharp: list[NDArray[np.uint8]], tmp_path: Path, length: int, radians: float
 ) -> None:
     files = [tmp_path / f"{index}.png" for index in range(3)]
@@ -74,13 +76,13 @@ def test_motion_blur_is_told(
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", ["street", "shelfbox", "kitchen"])
-def test_sequences_are_sharp(name: str) -> None:
+def test_recorded_sequences_cause_no_warning(name: str) -> None:
     files = sorted((SHARED / "sequences" / name / "frames").iterdir())
     assert len(files) > 30
     assert blur_warning(files) is None
 
 
-def test_match_tells_of_images_that_it_writes(
+def test_match_reports_blurred_images_that_it_writes(
     sharp: list[NDArray[np.uint8]], encode: Encode, tmp_path: Path
 ) -> None:
     blurred = [cv2.resize(gaussian(p), None, fx=0.5, fy=0.5) for p in sharp]

@@ -29,13 +29,13 @@ from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.facts import frame_times
 
-# Every track is used, so one that an image sees does not depend on the other images.
+# All tracks are used, so the observations of an image do not depend on the other images.
 DENSE = MatchOptions(density=DensityOptions(preset="dense"), verify=VerifyOptions(verify="pairs"))
 LOSSLESS = ["-c:v", "libaom-av1", "-cpu-used", "8", "-lag-in-frames", "0", "-crf", "1"]
 
 
 def tracks_from(paths: np.ndarray, size: tuple[int, int] = (640, 480)) -> Tracks:
-    """Tracks seen in every frame: paths [num_tracks, num_frames, 2]."""
+    """Tracks observed in every frame: paths [num_tracks, num_frames, 2]."""
     num_tracks, num_frames = paths.shape[:2]
     count = num_tracks * num_frames
     return Tracks(
@@ -55,7 +55,7 @@ def still(num_frames: int) -> Tracks:
 
 
 def project(centres: np.ndarray, angles: np.ndarray) -> Tracks:
-    """Points at depths 4 to 20, seen from x = centre, turned about y by an angle."""
+    """Tracks of points at depths 4 to 20, for cameras at x = centre, rotated about y."""
     rng = np.random.default_rng(0)
     points = rng.uniform([-3, -2, 4], [3, 2, 20], (300, 3))
     paths = []
@@ -69,7 +69,9 @@ def project(centres: np.ndarray, angles: np.ndarray) -> Tracks:
 
 @settings(deadline=None)
 @given(st.integers(2, 60), st.integers(2, 60), st.randoms(use_true_random=False))
-def test_any_number_of_images_is_spread(num_frames: int, wanted: int, random: object) -> None:
+def test_any_number_of_images_is_spread_evenly_in_time(
+    num_frames: int, wanted: int, random: object
+) -> None:
     rng = np.random.default_rng(random.getrandbits(32))  # type: ignore[attr-defined]
     times = np.cumsum(rng.exponential(1.0, num_frames) ** 3 + 1e-3)
     options = ImageOptions(num_images=wanted)
@@ -84,7 +86,7 @@ def test_any_number_of_images_is_spread(num_frames: int, wanted: int, random: ob
     assert (frames[0], frames[-1]) == (0, num_frames - 1)
 
 
-def test_even_in_time_is_not_even_in_frames() -> None:
+def test_spread_is_even_in_time_if_times_are_known() -> None:
     # The first second has 30 frames, the second one 10.
     times = np.concatenate([np.arange(30) / 30, 1 + np.arange(11) / 10])
     frames = choose_frames(still(41), ImageOptions(num_images=5), times)
@@ -96,7 +98,7 @@ def test_even_in_time_is_not_even_in_frames() -> None:
 
 
 @pytest.mark.parametrize("fps", [2, 5, 7, 20])
-def test_fps_takes_the_frames_that_ffmpeg_takes(
+def test_fps_selects_the_same_frames_as_ffmpeg(
     encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, fps: int
 ) -> None:
     clip = encode(make_frames(25, 96, 64), tmp_path / "clip.mp4")
@@ -108,17 +110,18 @@ def test_fps_takes_the_frames_that_ffmpeg_takes(
     assert frames.tolist() == shown
 
 
-def test_parallax_sees_through_rotation() -> None:
+def test_parallax_is_nearly_independent_of_rotation() -> None:
     turning = parallax(project(np.zeros(11), np.linspace(0, 0.2, 11)))
     moving = parallax(project(np.linspace(0, 0.5, 11), np.zeros(11)))
     both = parallax(project(np.linspace(0, 0.5, 11), np.linspace(0, 0.2, 11)))
-    # 15 px a frame by rotation, of which a tenth counts; the same parallax with it and without.
+    # Rotation moves points by 15 px per frame, of which a tenth counts as parallax; the parallax of
+    # the translation is the same with and without rotation.
     assert np.median(turning) < 2
     assert np.median(moving) > 1.0
     np.testing.assert_allclose(np.median(both) - np.median(turning), np.median(moving), atol=0.6)
 
 
-def test_images_at_equal_parallax() -> None:
+def test_images_are_spread_evenly_in_parallax() -> None:
     # The camera stands still for a while, then moves.
     centres = np.concatenate([np.zeros(20), np.linspace(0, 1, 21)])
     options = ImageOptions(num_images=6, select="parallax")
@@ -127,7 +130,7 @@ def test_images_at_equal_parallax() -> None:
     np.testing.assert_allclose(frames[1:], [24, 28, 32, 36, 40], atol=1)
 
 
-def test_blurred_frames_are_left_for_sharp_ones_that_see_the_same() -> None:
+def test_blurred_frames_are_replaced_by_sharp_neighbours() -> None:
     tracks = tracks_from(np.full((50, 41, 2), 10.0))
     sharp = np.full(41, 10.0)
     sharp[[10, 20, 21, 30]] = 1.0
@@ -141,7 +144,7 @@ def test_blurred_frames_are_left_for_sharp_ones_that_see_the_same() -> None:
     frames = np.array([0, 10, 20, 30, 40], dtype=np.int32)
     assert skip_blurred(frames, tracks, sharpness).tolist() == [0, 8, 22, 28, 40]
     assert asked == sorted(set(asked))
-    # A neighbour that has lost most tracks is no replacement.
+    # A neighbour that lost most tracks is not a replacement.
     lost = (tracks.frame == 22) & (np.repeat(np.arange(50), 41) > 5)
     kept = ~lost
     counts = np.bincount(np.repeat(np.arange(50), 41)[kept], minlength=50)
@@ -154,7 +157,7 @@ def test_blurred_frames_are_left_for_sharp_ones_that_see_the_same() -> None:
     assert skip_blurred(frames, thinner, sharpness).tolist() == [0, 8, 18, 28, 40]
 
 
-def test_frame_list(tmp_path: Path) -> None:
+def test_frame_list_is_read(tmp_path: Path) -> None:
     path = tmp_path / "list.txt"
     path.write_text("# mine\n\n9 last one.png\n0\nimg_0005.jpg\n")
     chosen = read_frame_list(path, 10, ImageOptions(first_number=1))
@@ -175,7 +178,9 @@ def test_frame_list(tmp_path: Path) -> None:
         (None, r"list\.txt"),
     ],
 )
-def test_bad_frame_lists(tmp_path: Path, text: str | bytes | None, message: str) -> None:
+def test_invalid_frame_lists_are_refused(
+    tmp_path: Path, text: str | bytes | None, message: str
+) -> None:
     if text is not None:
         (tmp_path / "list.txt").write_bytes(text if isinstance(text, bytes) else text.encode())
     options = ImageOptions(frame_list=str(tmp_path / "list.txt"))
@@ -185,7 +190,7 @@ def test_bad_frame_lists(tmp_path: Path, text: str | bytes | None, message: str)
         )
 
 
-def test_rate_needs_times() -> None:
+def test_fps_needs_frame_times() -> None:
     with pytest.raises(OptionError, match="time"):
         choose_frames(still(10), ImageOptions(fps=2))
 
@@ -195,10 +200,10 @@ def cut(clip: Path) -> list[np.ndarray]:
     return [picture for _, picture in decode_frames(clip)]
 
 
-def test_folder_of_others_is_used_as_it_is(
+def test_existing_folder_is_used_without_changes(
     clip: Path, cut: list[np.ndarray], tmp_path: Path
 ) -> None:
-    # As a script writes every third frame, half as large, numbered from 1, as JPEG.
+    # A script wrote every third frame at half size as JPEG, numbered from 1.
     folder = tmp_path / "input"
     folder.mkdir()
     for number, picture in enumerate(cut[1::3], start=1):
@@ -230,7 +235,7 @@ def save(folder: Path, pictures: Sequence[np.ndarray], name: str = "x%d.png") ->
     return folder
 
 
-def test_images_that_look_like_no_frame_or_like_many_are_refused(
+def test_images_that_match_no_frame_or_many_are_refused(
     clip: Path, cut: list[np.ndarray], encode: Encode, tmp_path: Path
 ) -> None:
     folder = save(tmp_path / "others", [255 - cut[3 * number] for number in range(5)])
@@ -246,8 +251,10 @@ def test_images_that_look_like_no_frame_or_like_many_are_refused(
     assert not (tmp_path / "a.db").exists()
 
 
-def test_images_named_as_ours_but_from_one_on(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
-    """As ffmpeg numbers them: each is one frame earlier than its name would say."""
+def test_images_with_our_names_may_be_numbered_from_one(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """ffmpeg numbers images from 1, so each shows the frame before its number."""
     (tmp_path / "cut").mkdir()
     ffmpeg("-i", clip, tmp_path / "cut" / "frame_%06d.png")
     report = match(tmp_path / "a.db", clip, image_path=tmp_path / "cut", options=DENSE)
@@ -256,7 +263,7 @@ def test_images_named_as_ours_but_from_one_on(clip: Path, ffmpeg: Ffmpeg, tmp_pa
     found, wanted = keypoints(tmp_path / "a.db"), keypoints(tmp_path / "b.db")
     for ours, theirs in zip(found, wanted, strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    # Two of them are missing: their content says which frames the others are.
+    # Two images are missing: the frames of the others are found by content.
     for number in (3, 16):
         (tmp_path / "cut" / f"frame_{number:06d}.png").unlink()
     report = match(tmp_path / "c.db", clip, image_path=tmp_path / "cut", options=DENSE)
@@ -266,25 +273,27 @@ def test_images_named_as_ours_but_from_one_on(clip: Path, ffmpeg: Ffmpeg, tmp_pa
         assert set(map(tuple, ours)) <= set(map(tuple, theirs))
 
 
-def test_folder_of_all_frames_of_another_video(
+def test_folder_of_another_video_is_refused(
     clip: Path, cut: list[np.ndarray], tmp_path: Path
 ) -> None:
     folder = save(tmp_path / "other", [picture[::-1] for picture in cut])
     with pytest.raises(ImageError, match=r"x0\.png"):
         match(tmp_path / "a.db", clip, image_path=folder)
-    # Under our own names, too, be it of all frames or of some.
+    # Also with our own names.
     folder = save(tmp_path / "ours", [picture[::-1] for picture in cut[:3]], "frame_%06d.png")
     with pytest.raises(ImageError, match=r"frame_000000\.png"):
         match(tmp_path / "a.db", clip, image_path=folder)
     assert len(list(folder.iterdir())) == 3
-    # As many as frames, but one was lost and another one is there twice.
+    # The number of images is right, but one is missing and another one exists twice.
     folder = save(tmp_path / "odd", [*cut[:4], *cut[5:], cut[2]])
     with pytest.raises(ImageError, match=r"x15\.png"):
         match(tmp_path / "a.db", clip, image_path=folder)
 
 
-def test_a_folder_in_which_pictures_repeat(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
-    """ffmpeg's filter for a higher rate repeats pictures, one for a lower rate does not."""
+def test_repeated_images_in_a_folder_are_reported(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """ffmpeg's fps filter repeats frames at a higher rate, but not at a lower one."""
     folder = tmp_path / "fps"
     folder.mkdir()
     ffmpeg("-i", clip, "-vf", "fps=30", folder / "%04d.png")
@@ -296,7 +305,7 @@ def test_a_folder_in_which_pictures_repeat(clip: Path, ffmpeg: Ffmpeg, tmp_path:
     assert len(list(folder.iterdir())) == num_files
 
 
-def test_images_of_a_folder_that_may_not_be_written(
+def test_read_only_folder_of_images_is_used(
     clip: Path, cut: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = save(tmp_path / "cut", cut)
@@ -312,7 +321,7 @@ def test_images_of_a_folder_that_may_not_be_written(
 @pytest.mark.parametrize(
     ("name", "error"), [("../a.png", ImageError), ("/a.png", ImageError), ("a.tif", OptionError)]
 )
-def test_names_that_cannot_be_written(
+def test_unwritable_image_names_are_refused(
     clip: Path, tmp_path: Path, name: str, error: type[Exception]
 ) -> None:
     (tmp_path / "list.txt").write_text(f"0 {name}\n3 b.png\n")
@@ -322,10 +331,10 @@ def test_names_that_cannot_be_written(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["list.txt"]
 
 
-def test_images_as_they_are_stored(
+def test_images_may_be_stored_without_rotation(
     clip: Path, cut: list[np.ndarray], ffmpeg: Ffmpeg, tmp_path: Path
 ) -> None:
-    """Programs that do not turn pictures: shape or content says so, keypoints follow."""
+    """Some programs do not rotate pictures; this is detected by size or content."""
     match(tmp_path / "plain.db", clip, options=DENSE)
     expected = keypoints(tmp_path / "plain.db")
     folder = save(tmp_path / "stored", cut)
@@ -351,7 +360,7 @@ def test_every_with_existing_images(clip: Path, cut: list[np.ndarray], tmp_path:
         return match(tmp_path / name, clip, image_path=folder, options=options)
 
     assert run("a.db", every=3).num_images == 6
-    # One was sorted out: the numbers say which, where they start.
+    # One image was removed: its number shows which, if the first number is given.
     (folder / "x2.png").unlink()
     assert run("b.db", every=3, first_number=0).num_images == 5
     kept = [k for i, k in enumerate(keypoints(tmp_path / "a.db")) if i != 2]

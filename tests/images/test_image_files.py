@@ -47,7 +47,7 @@ def test_image_names_count_from_zero() -> None:
         ".%d.png",
     ],
 )
-def test_patterns_that_cannot_work(pattern: str) -> None:
+def test_invalid_name_patterns_are_refused(pattern: str) -> None:
     with pytest.raises(OptionError):
         image_names(pattern, [0])
 
@@ -63,7 +63,9 @@ def test_patterns_that_cannot_work(pattern: str) -> None:
         (["f_10.png", "f_4.png"], 10, [9, 3]),
     ],
 )
-def test_frames_of_images(names: list[str], num_frames: int, frames: list[int]) -> None:
+def test_frames_are_found_from_image_names(
+    names: list[str], num_frames: int, frames: list[int]
+) -> None:
     assert frames_of_images(names, num_frames).tolist() == frames
 
 
@@ -79,20 +81,22 @@ def test_frames_of_images(names: list[str], num_frames: int, frames: list[int]) 
         (["a/0.png", "b/0.png", "b/5.png"], 10, "two"),
     ],
 )
-def test_images_that_do_not_fit(names: list[str], num_frames: int, reason: str) -> None:
+def test_image_names_without_clear_frames_are_refused(
+    names: list[str], num_frames: int, reason: str
+) -> None:
     with pytest.raises(ImageError, match=reason) as caught:
         frames_of_images(names, num_frames)
     assert "\n" not in str(caught.value)
 
 
-def test_first_number_settles_it() -> None:
+def test_first_number_resolves_ambiguous_names() -> None:
     assert frames_of_images(["2.png", "3.png"], 10, first_number=1).tolist() == [1, 2]
     assert frames_of_images(["2.png", "3.png"], 2, first_number=2).tolist() == [0, 1]
     with pytest.raises(ImageError, match="10"):
         frames_of_images(["0.png", "3.png"], 10, first_number=1)
 
 
-def test_sizes() -> None:
+def test_size_of_images() -> None:
     assert size_of_images({}, SIZE) == SIZE
     assert size_of_images({"a": SIZE}, SIZE) == SIZE
     assert size_of_images({"a": (96, 64), "b": (96, 64)}, SIZE) == (96, 64)
@@ -106,7 +110,7 @@ def test_sizes() -> None:
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg"])
-def test_written_images_are_the_frames(clip: Path, tmp_path: Path, ending: str) -> None:
+def test_images_are_written(clip: Path, tmp_path: Path, ending: str) -> None:
     frames = [0, 3, 15]
     names = image_names(f"frame_%06d.{ending}", frames)
     done: list[int] = []
@@ -134,8 +138,8 @@ def test_existing_images_are_kept(clip: Path, tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
 @pytest.mark.parametrize("locale", ["C", "C.UTF-8"])
 @pytest.mark.parametrize("name", [b"loc\xe9", "locé".encode()])
-def test_paths_that_are_not_utf_8(tmp_path: Path, name: bytes, locale: str) -> None:
-    """OpenCV's own functions for files crash on some of them."""
+def test_paths_need_not_be_utf_8(tmp_path: Path, name: bytes, locale: str) -> None:
+    """OpenCV's functions for files crash on some of these paths."""
     folder = tmp_path / os.fsdecode(name)
     folder.mkdir()
     picture = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
@@ -154,14 +158,14 @@ sys.stdout.buffer.write(bytes([*image_size(path)]) + read_image(path).tobytes())
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes of a Unix")
-def test_pipes_are_no_images(tmp_path: Path) -> None:
+def test_pipes_are_refused_as_images(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.png")
     for read in (image_size, read_image):
         with pytest.raises(ImageError):
             read(tmp_path / "a.png")
 
 
-def test_names_that_no_database_can_hold(tmp_path: Path) -> None:
+def test_image_names_must_be_utf_8(tmp_path: Path) -> None:
     name = os.fsdecode(b"\xe9")
     with pytest.raises(OptionError, match="not UTF-8"):
         image_names(f"{name}%d.png", [0])
@@ -174,7 +178,7 @@ def test_names_that_no_database_can_hold(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg"])
-def test_existing_images_of_another_size(tmp_path: Path, ending: str) -> None:
+def test_existing_images_of_another_size_are_refused(tmp_path: Path, ending: str) -> None:
     name = f"frame_000003.{ending}"
     cv2.imwrite(str(tmp_path / name), np.zeros((64, 96, 3), np.uint8))
     with pytest.raises(ImageError, match=name):
@@ -184,7 +188,7 @@ def test_existing_images_of_another_size(tmp_path: Path, ending: str) -> None:
     check_image_folder(tmp_path, f"other_%06d.{ending}", SIZE)
 
 
-def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
+def test_unusable_image_folders_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("no image")
     with pytest.raises(ImageError, match="file"):
@@ -196,14 +200,14 @@ def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
         check_image_folder(tmp_path, ["a.png"], SIZE)
 
 
-def test_frames_that_do_not_exist(clip: Path, tmp_path: Path) -> None:
+def test_missing_frames_are_an_error(clip: Path, tmp_path: Path) -> None:
     with pytest.raises(ImageError, match="16"):
         write_images(clip, tmp_path, ["a.png"], [16])
 
 
 @contextmanager
 def no_space() -> Iterator[None]:
-    """Lets no file grow beyond 10 kB, which fails where a full disk does."""
+    """Limit files to 10 kB, which fails in the same place as a full disk."""
     resource = pytest.importorskip("resource")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
@@ -214,7 +218,7 @@ def no_space() -> Iterator[None]:
 
 
 def test_full_disk_leaves_no_partial_image(clip: Path, tmp_path: Path) -> None:
-    # Only around the call: the test's own output may go to a file, too.
+    # Only around the call, because the output of the test may also go to a file.
     with no_space(), pytest.raises(ImageError, match=r"a\.png"):
         write_images(clip, tmp_path, ["a.png"], [0])
     assert list(tmp_path.iterdir()) == []
@@ -231,7 +235,7 @@ def test_leftovers_of_killed_processes_are_removed(clip: Path, tmp_path: Path) -
     assert {p.name for p in tmp_path.iterdir()} == {"a.png", *others}
 
 
-def test_frames_that_change_their_size(encode: Encode, tmp_path: Path) -> None:
+def test_change_of_size_is_an_error(encode: Encode, tmp_path: Path) -> None:
     both = encode_two_sizes(encode, tmp_path / "both.obu", 2)
     with pytest.raises(ImageError, match="128x128"):
         write_images(both, tmp_path / "out", [f"{i}.png" for i in range(4)], range(4))

@@ -1,4 +1,4 @@
-"""Masks: which pixels of frames and images count."""
+"""Masks select which pixels of frames and images are used."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from colmap_av1.options import DensityOptions, ImageOptions, LinkOptions, MaskOp
 from colmap_av1.tracks.tracks import Tracks
 
 WIDTH, HEIGHT, NUM_FRAMES = 192, 128, 16
-# Most of the left half is left out.
+# Excludes most of the left half.
 LEFT = np.full((HEIGHT, WIDTH), 255, np.uint8)
 LEFT[:100, :90] = 0
 
@@ -42,7 +42,7 @@ def write(path: Path, mask: NDArray[np.uint8]) -> Path:
 
 
 def positions(database: Path) -> dict[str, NDArray[np.int64]]:
-    """The pixels of the keypoints of each image."""
+    """The keypoints of each image, rounded down to pixels."""
     return {name: xy.astype(np.int64) for name, xy in keypoints_of(database).items()}
 
 
@@ -52,13 +52,13 @@ def num_on_black(xy: NDArray[np.int64], mask: NDArray[np.uint8]) -> int:
 
 @pytest.fixture(scope="module")
 def whole(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, NDArray[np.int64]]:
-    """Keypoints without any mask."""
+    """Keypoints without masks."""
     database = tmp_path_factory.mktemp("whole") / "a.db"
     match(database, clip)
     return positions(database)
 
 
-def test_one_mask_is_for_all_frames(
+def test_single_mask_applies_to_all_frames(
     clip: Path, whole: dict[str, NDArray[np.int64]], tmp_path: Path
 ) -> None:
     mask = write(tmp_path / "mask.png", LEFT)
@@ -68,12 +68,12 @@ def test_one_mask_is_for_all_frames(
     for name, xy in found.items():
         assert num_on_black(whole[name], LEFT) > 50
         assert num_on_black(xy, LEFT) == 0
-        # Only tracks that cross the edge are lost beside what is black.
+        # Apart from the black pixels, only tracks that cross the edge are lost.
         assert len(xy) > 0.8 * (len(whole[name]) - num_on_black(whole[name], LEFT))
 
 
-def test_masks_of_images_in_both_layouts(clip: Path, tmp_path: Path) -> None:
-    """COLMAP's, and that of trainers, which have .png for the image's extension."""
+def test_masks_of_images_are_read_in_both_layouts(clip: Path, tmp_path: Path) -> None:
+    """COLMAP appends .png to the image name; trainers replace the extension by .png."""
     names = [f"frame_{i:06d}.jpg" for i in range(0, NUM_FRAMES, 3)]
     found = []
     for layout in ("colmap", "trainers"):
@@ -93,9 +93,9 @@ def test_masks_of_images_in_both_layouts(clip: Path, tmp_path: Path) -> None:
 def test_masks_of_frames_end_tracks_between_images(
     preset: Literal["default", "dense"], clip: Path, tmp_path: Path
 ) -> None:
-    """A frame that is no image has its say: no track crosses one that is all black.
+    """No track crosses a frame with a black mask, even if the frame is not an image.
 
-    Among many there are some that it does not see, and that are seen before and after it.
+    With many tracks, some are not observed in this frame, but before and after it.
     """
     for i in range(NUM_FRAMES):
         write(tmp_path / "masks" / f"{i + 1}.png", LEFT * 0 if i == 7 else LEFT * 0 + 255)
@@ -121,10 +121,10 @@ def test_masks_of_frames_end_tracks_between_images(
     assert report.links.frames_of_gaps() == [(6, 8)]
 
 
-def test_masks_of_other_pixels_change_nothing(
+def test_only_black_pixels_are_excluded(
     clip: Path, whole: dict[str, NDArray[np.int64]], tmp_path: Path
 ) -> None:
-    """Dark colours count, and so do transparent pixels: only black is black."""
+    """Dark colours and transparent pixels are not excluded."""
     dark = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
     dark[..., 0] = 1
     match(tmp_path / "a.db", clip, options=options(write(tmp_path / "dark.png", dark)))
@@ -132,8 +132,8 @@ def test_masks_of_other_pixels_change_nothing(
     assert all(np.array_equal(found[name], xy) for name, xy in whole.items())
 
 
-def test_links_have_no_features_on_masks(encode: Encode, tmp_path: Path) -> None:
-    """Where motion breaks off, pictures are looked at: through the masks."""
+def test_links_use_no_features_on_masks(encode: Encode, tmp_path: Path) -> None:
+    """SIFT features at gaps in the motion respect the masks."""
     frames = make_frames(12)
     frames[6:] = make_frames(24)[18:]
     clip = encode(frames, tmp_path / "jerk.mp4")
@@ -144,7 +144,7 @@ def test_links_have_no_features_on_masks(encode: Encode, tmp_path: Path) -> None
 
 
 def bad_masks(kind: str, folder: Path) -> Path:
-    """Masks that fit no clip of 16 frames of 192x128."""
+    """Masks that do not fit a clip of 16 frames of 192x128."""
     if kind == "size":
         return write(folder / "small.png", LEFT[:64])
     if kind == "number":
@@ -185,7 +185,7 @@ WORDS = {
 
 
 @pytest.mark.parametrize("kind", WORDS)
-def test_what_does_not_fit_is_one_line(
+def test_unusable_masks_are_refused_in_one_line(
     kind: str,
     clip: Path,
     tmp_path: Path,
@@ -206,7 +206,7 @@ def test_what_does_not_fit_is_one_line(
     assert not (tmp_path / "a.db").exists()
 
 
-def test_each_video_has_its_own(tmp_path: Path) -> None:
+def test_each_video_has_its_own_masks(tmp_path: Path) -> None:
     for name in ("a/1.png", "a/2.png", "b/x.jpg.png", "photos/y.png"):
         write(tmp_path / name, LEFT)
     masks = read_masks(tmp_path, ["a", "b", "c"], [2, 2, 2])
@@ -229,7 +229,7 @@ def test_each_video_has_its_own(tmp_path: Path) -> None:
     st.integers(1, 30),
     st.integers(0, 2**31),
 )
-def test_masks_keep_their_pixels(width: int, height: int, seed: int) -> None:
+def test_masks_are_stored_exactly(width: int, height: int, seed: int) -> None:
     kept = np.random.default_rng(seed).random((height, width)) < 0.5
     mask = make_mask(kept)
     assert np.array_equal(mask.kept, kept)
@@ -242,8 +242,8 @@ def test_masks_keep_their_pixels(width: int, height: int, seed: int) -> None:
 
 
 @given(st.lists(st.lists(st.booleans(), min_size=1, max_size=9), min_size=1, max_size=6))
-def test_tracks_end_where_a_mask_begins(tracks: list[list[bool]]) -> None:
-    """Each observation stands on a white or a black pixel; what is left are runs of white ones."""
+def test_tracks_are_cut_at_masks(tracks: list[list[bool]]) -> None:
+    """Each observation is on a white or a black pixel; the runs on white pixels remain."""
     flat = np.concatenate([np.array(t) for t in tracks])
     mask = make_mask(np.array([[True, False]]))
     n = len(flat)
@@ -282,13 +282,13 @@ def test_tracks_end_where_a_mask_begins(tracks: list[list[bool]]) -> None:
     st.dictionaries(st.integers(0, 8), st.lists(st.booleans(), min_size=4, max_size=4)),
     st.integers(0, 2**31),
 )
-def test_tracks_end_at_masks_of_frames_that_do_not_see_them(
+def test_tracks_are_cut_at_masks_of_frames_between_observations(
     frames: list[set[int]], white: dict[int, list[bool]], seed: int
 ) -> None:
-    """Between two frames that see it a track is on the straight way between its places there."""
+    """Between two observations, a track is assumed to move along a straight line."""
     seen = [sorted(own) for own in frames]
     lengths = [len(own) for own in seen]
-    # Not on the edges of pixels, and no way of a share of eighths or less leads there.
+    # Neither these positions nor interpolated ones are on the edges of pixels.
     x = np.random.default_rng(seed).integers(0, 4, sum(lengths)) + np.float32(0.45)
     given_tracks = Tracks(
         num_frames=9,

@@ -23,7 +23,7 @@ from colmap_av1.video.encode import stream_of
 from colmap_av1.video.facts import read_video
 
 OPTIONS = MatchOptions()
-# No video here is converted to a stream that is not kept.
+# Not used, because no video here is converted to a temporary stream.
 NEXT_TO = Path("absent/a.db")
 LAYERS = PROJECT / "tests" / "data" / "conformance" / "svc_L2T1.ivf"
 
@@ -44,7 +44,7 @@ def prepared(
     )
 
 
-def test_without_a_folder_no_picture_is_decoded(clip: Path) -> None:
+def test_no_picture_is_decoded_without_an_image_folder(clip: Path) -> None:
     clock, stages = Clock(), set()
     found = prepare_images(
         read_video(clip),
@@ -62,7 +62,7 @@ def test_without_a_folder_no_picture_is_decoded(clip: Path) -> None:
 
 
 def test_tracks_are_in_pixels_of_scaled_images(clip: Path, tmp_path: Path) -> None:
-    """By different factors along x and y, as programs do that make sizes even."""
+    """The factors along x and y differ, as with programs that round sizes to even numbers."""
     (tmp_path / "images").mkdir()
     for index, picture in decode_frames(clip):
         small = cv2.resize(picture, (96, 63), interpolation=cv2.INTER_AREA)
@@ -73,7 +73,7 @@ def test_tracks_are_in_pixels_of_scaled_images(clip: Path, tmp_path: Path) -> No
     factor = np.array([96 / 192, 63 / 128])
     in_video = prepared(clip).tracked.tracks
     np.testing.assert_allclose(found.tracked.tracks.xy, in_video.xy * factor, rtol=1e-6)
-    # A pixel of the images is 2 of the video wide and 128 / 63 high.
+    # A pixel of the images is 2 video pixels wide and 128 / 63 high.
     assert found.pixel_aspect == pytest.approx(2 / (128 / 63))
     listed = {f"{i}.png": (96, 63) for i in range(16)}
     assert prepared(clip, listed=listed).size == (96, 63)
@@ -88,14 +88,14 @@ def test_layers_of_a_scalable_stream_have_their_own_size(
     assert first.size == (first.tracked.tracks.width, first.tracked.tracks.height) == size
     names, frames = first.tracked.chosen.names, first.tracked.chosen.frames
     write_images(LAYERS, tmp_path, names, frames.tolist(), operating_point=operating_point)
-    # They are what another run finds.
+    # A second run accepts these images.
     assert prepared(LAYERS, tmp_path, options).size == size
 
 
-def test_a_stream_of_another_size_than_its_video_is_refused(
+def test_stream_of_another_size_than_its_video_is_refused(
     encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path
 ) -> None:
-    """As an encoder makes it that wants sizes of its own."""
+    """Some encoders only support certain sizes."""
     video = encode(make_frames(6), tmp_path / "v.mp4", "-c:v", "libx264")
     stream = tmp_path / "stream.mp4"
     options = replace(OPTIONS, encode=EncodeOptions(encoder="libaom"), keep_stream=str(stream))
@@ -109,7 +109,7 @@ def test_a_stream_of_another_size_than_its_video_is_refused(
         prepared(video, options=options)
 
 
-def test_images_of_an_earlier_run_must_be_of_this_video(
+def test_existing_images_of_another_video_are_refused(
     clip: Path, encode: Encode, tmp_path: Path
 ) -> None:
     other = encode(np.ascontiguousarray(make_frames(16)[:, ::-1]), tmp_path / "other.mp4")

@@ -24,7 +24,7 @@ EXAMPLE = PROJECT / "examples" / "scene.mp4"
 
 
 def pan(num_frames: int, step: float, seed: int = 0) -> list[np.ndarray]:
-    """A smooth random scene, seen by a camera that moves by `step` px a frame."""
+    """A smooth random scene, seen by a camera that pans by `step` px per frame."""
     rng = np.random.default_rng(seed)
     scene = rng.uniform(0, 255, (180, int(240 + step * num_frames) + 2, 3)).astype(np.float32)
     scene = cv2.normalize(cv2.GaussianBlur(scene, (0, 0), 8), None, 0, 255, cv2.NORM_MINMAX)
@@ -46,7 +46,7 @@ def write(folder: Path, pictures: list[np.ndarray], ending: str = "png") -> list
 
 @settings(deadline=None)
 @given(st.data())
-def test_assignment_is_the_best_ascending_one(data: st.DataObject) -> None:
+def test_ascending_assignment_is_optimal(data: st.DataObject) -> None:
     num_images = data.draw(st.integers(1, 4))
     num_frames = data.draw(st.integers(num_images, 7))
     values = st.lists(st.integers(0, 9), min_size=num_frames, max_size=num_frames)
@@ -72,7 +72,7 @@ def test_assignment_is_the_best_ascending_one(data: st.DataObject) -> None:
     ending=st.sampled_from(["png", "jpg"]),
     shuffled=st.booleans(),
 )
-def test_images_are_found_however_they_were_written(
+def test_frames_are_found_at_any_scale_order_and_format(
     tmp_path: Path, frames: set[int], scale: float, ending: str, shuffled: bool
 ) -> None:
     pictures = _PAN
@@ -96,7 +96,9 @@ def test_images_are_found_however_they_were_written(
     ],
     ids=["fps", "half", "thumbnail"],
 )
-def test_frames_that_ffmpeg_picked(ffmpeg: Ffmpeg, tmp_path: Path, how: list[str]) -> None:
+def test_frames_selected_by_ffmpeg_are_found(
+    ffmpeg: Ffmpeg, tmp_path: Path, how: list[str]
+) -> None:
     (tmp_path / "cut").mkdir()
     ffmpeg("-i", EXAMPLE, *how, tmp_path / "cut" / "%03d.jpg")
     files = sorted((tmp_path / "cut").iterdir())
@@ -114,8 +116,8 @@ def test_frames_that_ffmpeg_picked(ffmpeg: Ffmpeg, tmp_path: Path, how: list[str
         assert min(difference, key=lambda f: difference[f]) == frame
 
 
-def test_one_frame_twice(tmp_path: Path) -> None:
-    """As ffmpeg writes it where time stamps have a gap."""
+def test_frame_that_appears_twice_is_refused(tmp_path: Path) -> None:
+    """ffmpeg repeats a frame where timestamps have a gap."""
     pictures = pan(12, 2)
     files = write(tmp_path / "images", [pictures[i] for i in (0, 4, 4, 8)])
     with pytest.raises(ImageError, match=r"002\.png") as info:
@@ -123,7 +125,7 @@ def test_one_frame_twice(tmp_path: Path) -> None:
     assert "\n" not in str(info.value)
 
 
-def test_camera_that_stands_still_for_a_while(tmp_path: Path) -> None:
+def test_frames_of_a_pausing_camera_are_found(tmp_path: Path) -> None:
     moving = pan(10, 2)
     pictures = [moving[0]] * 8 + moving
     files = write(tmp_path / "images", [pictures[i] for i in (0, 5, 10, 15)])
@@ -133,14 +135,14 @@ def test_camera_that_stands_still_for_a_while(tmp_path: Path) -> None:
     assert found[2:].tolist() == [10, 15]
 
 
-def test_scene_that_comes_back(tmp_path: Path) -> None:
+def test_repeated_scene_is_ambiguous(tmp_path: Path) -> None:
     there = pan(8, 2)
     files = write(tmp_path / "images", [there[i] for i in (1, 4)])
     with pytest.raises(ImageError, match=r"frame [14] .* frame (9|12)"):
         frames_by_content(files, enumerate(there + there))
 
 
-def test_other_pictures(tmp_path: Path) -> None:
+def test_unrelated_images_are_refused(tmp_path: Path) -> None:
     files = write(tmp_path / "images", pan(3, 2, seed=1))
     with pytest.raises(ImageError, match="no frame"):
         frames_by_content(files, enumerate(pan(12, 2)))
@@ -151,7 +153,7 @@ def test_other_pictures(tmp_path: Path) -> None:
         frames_by_content(files, enumerate(pan(12, 2)))
 
 
-def test_content_off_by_one(tmp_path: Path) -> None:
+def test_content_check_detects_an_offset_of_one_frame(tmp_path: Path) -> None:
     pictures = pan(12, 2)
     files = write(tmp_path / "images", [pictures[3], pictures[9]], "jpg")
     check_content(files, [3, 9], enumerate(pictures))
@@ -164,7 +166,7 @@ def test_content_off_by_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("turn", [((-1, 0), (0, -1)), ((1, 0), (0, -1)), ((0, 1), (1, 0))])
-def test_how_images_are_turned(
+def test_unrotated_images_are_recognised(
     tmp_path: Path, turn: tuple[tuple[int, int], tuple[int, int]]
 ) -> None:
     display = Display(turn=turn)
