@@ -21,7 +21,7 @@ def reconstruction() -> pycolmap.Reconstruction:
 
 
 @pytest.mark.parametrize("write", ["write_binary", "write_text"])
-def test_models_of_both_formats_are_read(
+def test_binary_and_text_models_are_read(
     reconstruction: pycolmap.Reconstruction, tmp_path: Path, write: str
 ) -> None:
     getattr(reconstruction, write)(tmp_path)
@@ -31,7 +31,7 @@ def test_models_of_both_formats_are_read(
     np.testing.assert_allclose(sorted(tuple(p.xyz) for p in read.points3D.values()), written)
 
 
-def test_points_without_a_position_are_left_out(
+def test_points_with_invalid_positions_are_dropped(
     reconstruction: pycolmap.Reconstruction, tmp_path: Path
 ) -> None:
     some = list(reconstruction.points3D)[:3]
@@ -46,7 +46,7 @@ def test_points_without_a_position_are_left_out(
         check_model(read)
 
 
-def test_what_is_no_model_is_refused(
+def test_files_other_than_models_are_refused(
     reconstruction: pycolmap.Reconstruction, tmp_path: Path
 ) -> None:
     with pytest.raises(ModelError, match="no COLMAP model"):
@@ -68,7 +68,7 @@ def test_what_is_no_model_is_refused(
         read_model(model)
 
 
-def test_a_model_without_poses_is_refused(tmp_path: Path) -> None:
+def test_model_without_poses_is_refused(tmp_path: Path) -> None:
     pycolmap.Reconstruction().write_text(tmp_path)
     with pytest.raises(ModelError, match="pose"):
         read_model(tmp_path)

@@ -1,4 +1,4 @@
-"""Share of the images that points fill."""
+"""Coverage: the share of the images that points fill."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SIZE = (160, 96)
 PLAIN = pycolmap.Camera(
     camera_id=1, model="PINHOLE", width=SIZE[0], height=SIZE[1], params=[100, 100, 80, 48]
 )
-# Folds far rays back into the picture.
+# The distortion folds far rays back into the image.
 BENT = pycolmap.Camera(
     camera_id=2, model="SIMPLE_RADIAL", width=SIZE[0], height=SIZE[1], params=[100, 80, 48, -0.1]
 )
@@ -28,8 +28,8 @@ def at_cells(depth: float, camera: pycolmap.Camera = PLAIN) -> np.ndarray:
 
 
 @pytest.mark.parametrize("camera", [PLAIN, BENT])
-def test_points_in_the_picture(camera: pycolmap.Camera) -> None:
-    """Those that COLMAP's camera puts there, beside and behind it too many for a chunk."""
+def test_projection_agrees_with_colmap(camera: pycolmap.Camera) -> None:
+    """With points outside the image and behind the camera, and more points than in a chunk."""
     rng = np.random.default_rng(1)
     angles = rng.uniform(-3, 3, 3)
     rotation = pycolmap.Rotation3d(angles).matrix()
@@ -37,7 +37,7 @@ def test_points_in_the_picture(camera: pycolmap.Camera) -> None:
     xyz = rng.normal(0, 2, (5000, 3))
     local = xyz @ rotation.T + view.cam_from_world[:, 3]
     there = np.flatnonzero(local[:, 2] > 0)
-    # Beyond what the picture shows a distortion folds rays back into it.
+    # Outside the field of view the distortion folds rays back into the image.
     rays = local[there, :2] / local[there, 2:]
     there = there[(np.abs(rays) < [1.0, 0.6]).all(axis=1)]
     at = np.asarray(camera.img_from_cam(local[there])).reshape(-1, 2)
@@ -50,7 +50,7 @@ def test_points_in_the_picture(camera: pycolmap.Camera) -> None:
 
 
 @pytest.mark.parametrize("camera", [PLAIN, BENT])
-def test_share_of_cells(camera: pycolmap.Camera) -> None:
+def test_coverage_is_the_share_of_cells(camera: pycolmap.Camera) -> None:
     view = PosedCamera(camera, HERE)
     points = at_cells(3.0, camera)
     assert len(points) == NUM_CELLS
@@ -62,8 +62,8 @@ def test_share_of_cells(camera: pycolmap.Camera) -> None:
     assert coverage([], points) == 0.0
 
 
-def test_images_count_alike() -> None:
-    """One that sees nothing halves the share."""
+def test_images_have_equal_weight() -> None:
+    """An image that sees no point halves the coverage."""
     turned = PosedCamera(PLAIN, np.column_stack([np.diag([1.0, -1.0, -1.0]), np.zeros(3)]))
     assert coverage([PosedCamera(PLAIN, HERE), turned], at_cells(3.0)) == 0.5
 
@@ -75,14 +75,14 @@ def test_points_behind_a_surface_do_not_fill_its_gap() -> None:
     gap = 2 * columns + 4
     wall = np.delete(near, gap, axis=0)
     assert coverage([view], np.concatenate([wall, far[[gap]]])) == pytest.approx(1 - 1 / NUM_CELLS)
-    # A point on the surface itself does, and so does what lies beside a surface's edge.
+    # A point on the surface fills it, and points next to the edge of a surface count as well.
     assert coverage([view], np.concatenate([wall, 1.1 * near[[gap]]])) == 1.0
     half = np.arange(NUM_CELLS) % columns < columns // 2
     assert coverage([view], np.where(half[:, None], near, far)) == 1.0
 
 
-def test_pixels_and_depths() -> None:
-    """Points outside the picture, behind it or folded back by distortion are not in it."""
+def test_projection_gives_pixels_and_depths() -> None:
+    """Points outside the image, behind the camera or folded back by distortion are dropped."""
     view = PosedCamera(BENT, np.column_stack([np.eye(3), [0.0, 0.0, 1.0]]))
     points = np.array([[0.5, 0.2, 1.0], [5.0, 0.0, 0.5], [0.1, 0.2, -3.0], [0.0, 0.0, 4.0]])
     index, xy, depth = view.project(points)

@@ -18,7 +18,7 @@ def pose(turn: tuple[float, float, float], centre: tuple[float, float, float]) -
 
 
 def sightings(poses: list[np.ndarray], counts: list[int], noise: float) -> Sightings:
-    """Points before the cameras, seen with noise in pixels, a fifth of them elsewhere."""
+    """Points in front of the cameras, with noise in pixels and a fifth of outliers."""
     rng = np.random.default_rng(3)
     xyz = [np.column_stack([rng.uniform(-2, 2, (n, 2)), rng.uniform(4, 8, n)]) for n in counts]
     rays = []
@@ -31,7 +31,7 @@ def sightings(poses: list[np.ndarray], counts: list[int], noise: float) -> Sight
     return Sightings(np.concatenate(rays), np.concatenate(xyz), bounds)
 
 
-def test_poses_are_found_from_near_and_from_wrong_guesses() -> None:
+def test_poses_are_found_from_good_and_bad_initial_poses() -> None:
     poses = [pose((0.02 * i, -0.05 * i, 0.01), (0.1 * i, 0.02 * i, 0.0)) for i in range(8)]
     seen = sightings(poses, [400] * 8, noise=0.3)
     near = np.array([pose((0.0, 0.0, 0.0), (0.1 * i, 0.0, 0.0)) for i in range(8)])
@@ -44,7 +44,7 @@ def test_poses_are_found_from_near_and_from_wrong_guesses() -> None:
             assert np.ptp(camera_centres(np.array([one, true])), axis=0).max() < 0.01
 
 
-def test_threads_change_nothing() -> None:
+def test_result_does_not_depend_on_threads() -> None:
     poses = [pose((0.0, 0.01 * i, 0.0), (0.1 * i, 0.0, 0.0)) for i in range(12)]
     seen = sightings(poses, [100] * 12, noise=0.5)
     guesses = np.array(poses[:1] * 12)
@@ -60,7 +60,7 @@ def test_too_few_points_give_no_pose() -> None:
     assert [one is not None for one in found] == [False, False, True]
 
 
-def test_poses_between_lie_on_the_way() -> None:
+def test_poses_are_interpolated() -> None:
     known = np.array([pose((0, 0, 0), (0, 0, 0)), pose((0, 0.4, 0), (2, 0, 4))])
     frames = np.array([10, 20], np.int32)
     between = interpolate_poses(known, frames, np.array([5, 10, 15, 20, 30], np.int32))
@@ -73,8 +73,8 @@ def test_poses_between_lie_on_the_way() -> None:
 
 
 @pytest.mark.parametrize("wanted", [(1, 3), (3,), ()])
-def test_sightings_are_those_of_the_tracks_that_have_points(wanted: tuple[int, ...]) -> None:
-    # Track 0 lies in all of five frames, 1 in the unknown ones only, 2 in frames 1 to 4.
+def test_sightings_come_from_tracks_with_points(wanted: tuple[int, ...]) -> None:
+    # Track 0 is in all five frames, track 1 only in those without a pose, track 2 in frames 1 to 4.
     frame = np.array([0, 1, 2, 3, 4, 1, 3, 1, 2, 3, 4], np.int32)
     xy = np.column_stack([10.0 + np.arange(11), 20.0 + np.arange(11)]).astype(np.float32)
     offsets, zero = np.array([0, 5, 7, 11]), np.zeros(11, np.float32)

@@ -31,7 +31,7 @@ POSES = [np.column_stack([np.eye(3), [-0.3 * i, 0, 0]]) for i in range(6)]
 
 
 def make_tracks(xy: np.ndarray) -> Tracks:
-    """Tracks [num_tracks, num_frames, 2] that all frames see."""
+    """Tracks [num_tracks, num_frames, 2] that are observed in all frames."""
     count, length = xy.shape[:2]
     return Tracks(
         length,
@@ -62,7 +62,7 @@ def make_points(observation: list[list[int]]) -> TriangulatedPoints:
         (TrackOptions(min_length=6, cell=4), 2, 6, 4),
     ],
 )
-def test_points_come_from_short_tracks_too(
+def test_chaining_for_points_keeps_short_tracks(
     given: TrackOptions, min_observations: int, min_length: int, cell: int
 ) -> None:
     triangulate = TriangulateOptions(min_observations=min_observations)
@@ -73,7 +73,7 @@ def test_points_come_from_short_tracks_too(
     assert (smaller.min_length, smaller.cell) == (min_length, given.cell)
 
 
-def test_views_are_places_among_the_frames() -> None:
+def test_views_are_indices_of_the_given_frames() -> None:
     tracks = make_tracks(np.arange(2 * 6 * 2.0).reshape(2, 6, 2))
     seen, view = seen_in(tracks, np.array([1, 4, 5], dtype=np.int32))
     assert seen.frame.tolist() == [1, 4, 5, 1, 4, 5]
@@ -81,7 +81,7 @@ def test_views_are_places_among_the_frames() -> None:
     np.testing.assert_array_equal(seen.xy, tracks.xy[[1, 4, 5, 7, 10, 11]])
 
 
-def test_images_of_several_cameras_see_one_scene() -> None:
+def test_points_are_triangulated_from_several_cameras() -> None:
     rng = np.random.default_rng(0)
     truth = rng.uniform([-1, -1, 5], [2, 1, 9], (50, 3))
     cameras = [PLAIN, PLAIN, BENT, BENT, PLAIN, BENT]
@@ -109,7 +109,7 @@ def test_images_of_several_cameras_see_one_scene() -> None:
 
     exact = found(None, seen.xy)
     np.testing.assert_allclose(exact.xyz, truth, rtol=1e-4)
-    # Errors are shares of the focal length that pixels are counted in.
+    # Errors are in pixels of the given camera.
     noisy = seen.xy + rng.normal(0, 0.2, seen.xy.shape).astype(np.float32)
     wide = pycolmap.Camera(
         camera_id=9, model="PINHOLE", width=WIDTH, height=HEIGHT, params=[50, 50, 320, 240]
@@ -118,8 +118,8 @@ def test_images_of_several_cameras_see_one_scene() -> None:
     assert 0.005 < np.median(found(wide, noisy).error) < 0.05
 
 
-def test_colours_are_the_middle_ones_of_the_pictures_that_see_a_point() -> None:
-    """A point in the middle, one in the corner, one of a single image, one twice in an image."""
+def test_colours_are_medians_over_the_images() -> None:
+    """Points at the centre, in the corner, in a single image, and twice in one image."""
     image = np.array([0, 1, 2, 0, 1, 2, 1, 0, 0, 2])
     xy = np.tile([[320.0, 240.0]], (10, 1))
     xy[3:6] = WIDTH, HEIGHT
@@ -134,14 +134,14 @@ def test_colours_are_the_middle_ones_of_the_pictures_that_see_a_point() -> None:
     for i, picture in enumerate((blue, white, half)):
         colours.add(i, picture)
     assert colours.rgb().tolist() == [
-        [100, 0, 0],  # brighter than blue, and white hides it in one picture
-        [0, 240, 0],  # beyond the last pixel is the last pixel
+        [100, 0, 0],  # the median by brightness of blue, white and red
+        [0, 240, 0],  # positions on the border use the last pixel
         [255, 255, 255],
         [0, 0, 200],
     ]
 
 
-def test_points_of_a_model_name_the_images_that_see_them() -> None:
+def test_model_points_list_the_images_that_observe_them() -> None:
     points = make_points([[4, 1], [0, 3, 5]])
     view = np.array([0, 1, 2, 0, 1, 2])
     xy = np.arange(10.0).reshape(5, 2)

@@ -13,21 +13,21 @@ FOCAL = 500.0
 
 
 def views(count: int) -> Views:
-    """Cameras that look along z and stand beside each other, 0.2 apart."""
+    """Cameras that look along z, in a row 0.2 apart."""
     poses = np.tile(np.eye(4)[:3], (count, 1, 1))
     poses[:, 0, 3] = -0.2 * np.arange(count)
     return Views(poses, np.full((count, 2), FOCAL))
 
 
 def rays_of(xyz: np.ndarray, seen_by: Views) -> np.ndarray:
-    """float64 [num_points, num_views, 2] exact rays."""
+    """Exact rays, float64 [num_points, num_views, 2]."""
     pose = seen_by.cam_from_world
     in_camera = np.einsum("vij,pj->pvi", pose[:, :, :3], xyz) + pose[None, :, :, 3]
     return in_camera[..., :2] / in_camera[..., 2:]
 
 
 def observations(rays: np.ndarray) -> Observations:
-    """Tracks that every view sees."""
+    """Tracks that are observed in every view."""
     num_tracks, num_views = rays.shape[:2]
     return Observations(
         np.arange(num_tracks + 1) * num_views,
@@ -48,7 +48,7 @@ def owners(points: TriangulatedPoints, num_views: int) -> np.ndarray:
     return points.observation[points.offsets[:-1]] // num_views
 
 
-def test_exact(scene: tuple[np.ndarray, Views]) -> None:
+def test_exact_rays_give_exact_points(scene: tuple[np.ndarray, Views]) -> None:
     xyz, seen_by = scene
     points = triangulate(observations(rays_of(xyz, seen_by)), seen_by)
     assert np.abs(points.xyz - xyz).max() < 1e-6
@@ -57,15 +57,15 @@ def test_exact(scene: tuple[np.ndarray, Views]) -> None:
     assert points.num_agreeing == points.num_tracks == 400
 
 
-def test_noise(scene: tuple[np.ndarray, Views]) -> None:
-    """As good as the noise allows: depth from a base of 1.6 at 6 px / 500 px."""
+def test_noisy_rays_give_the_expected_accuracy(scene: tuple[np.ndarray, Views]) -> None:
+    """The depth error corresponds to a baseline of 1.6 and the noise."""
     xyz, seen_by = scene
     rays = rays_of(xyz, seen_by)
     rays += np.random.default_rng(0).normal(0, 0.3 / FOCAL, rays.shape)
     points = triangulate(observations(rays), seen_by)
     off = points.xyz - xyz[owners(points, 9)]
     assert np.median(np.abs(off[:, 2]) / xyz[owners(points, 9), 2] ** 2) < 0.0006
-    # Mean length of two-dimensional noise, a ninth of its freedom taken by the point.
+    # The mean length of 2D noise, reduced by the degrees of freedom of the point.
     assert 0.3 < points.error.mean() < 0.38
 
 
@@ -81,7 +81,7 @@ def test_outliers_are_dropped(scene: tuple[np.ndarray, Views]) -> None:
     assert not np.isin(points.observation % 9, [0, 8]).any()
 
 
-def test_slid_track_is_two_points(scene: tuple[np.ndarray, Views]) -> None:
+def test_track_that_slides_gives_two_points(scene: tuple[np.ndarray, Views]) -> None:
     xyz, seen_by = scene
     rays = rays_of(xyz, seen_by)
     other = rays_of(xyz + np.array([0, 1.0, 0]), seen_by)
@@ -93,7 +93,7 @@ def test_slid_track_is_two_points(scene: tuple[np.ndarray, Views]) -> None:
     assert np.allclose(points.xyz[:2], [xyz[0], xyz[0] + np.array([0, 1.0, 0])], atol=1e-6)
 
 
-def test_what_is_no_point(scene: tuple[np.ndarray, Views]) -> None:
+def test_tracks_without_a_valid_point(scene: tuple[np.ndarray, Views]) -> None:
     _, seen_by = scene
     far = np.array([[0.0, 0.0, 4000.0]])
     behind = np.array([[0.5, 0.0, -6.0]])
@@ -112,8 +112,8 @@ def test_what_is_no_point(scene: tuple[np.ndarray, Views]) -> None:
     assert len(triangulate(nothing, seen_by).xyz) == 0
 
 
-def test_unsure_distances_are_no_points(scene: tuple[np.ndarray, Views]) -> None:
-    """What the angle and the errors of the rays tell of the distance decides."""
+def test_points_with_uncertain_depth_are_dropped(scene: tuple[np.ndarray, Views]) -> None:
+    """The depth error is estimated from the triangulation angle and the ray errors."""
     _, seen_by = scene
     rng = np.random.default_rng(7)
     xyz = np.column_stack(
@@ -121,7 +121,7 @@ def test_unsure_distances_are_no_points(scene: tuple[np.ndarray, Views]) -> None
     )
     noise = rng.uniform(0, 2, 4000)
     rays = rays_of(xyz, seen_by)
-    # Wrong alike in a part of the views, as tracks that drift are.
+    # The same error in some of the views, as with tracks that drift.
     rays[:, 5:, 0] += (noise * rng.choice([-1, 1], 4000))[:, None] / FOCAL
     every = TriangulateOptions(points="survey", max_depth_error=None)
     all_points = triangulate(observations(rays), seen_by, every)
@@ -147,7 +147,7 @@ def test_unusable_observations_are_ignored(scene: tuple[np.ndarray, Views]) -> N
     assert not np.any(points.observation % 9 == 4)
 
 
-def test_threads_change_nothing() -> None:
+def test_result_does_not_depend_on_threads() -> None:
     rng = np.random.default_rng(3)
     seen_by = views(12)
     rays = rays_of(rng.uniform([-2, -2, 4], [3, 2, 9], (40_000, 3)), seen_by)
@@ -162,7 +162,7 @@ def test_threads_change_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"view": np.array([0, 7])}, "of no view"),
         ({"view": np.array([0, 1, 1])}, "view, rays and sigma"),
@@ -172,7 +172,7 @@ def test_threads_change_nothing() -> None:
         ({"last": 2}, "no such tracks"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(changed: dict[str, Any], said: str) -> None:
+def test_mismatched_arrays_are_refused(changed: dict[str, Any], message: str) -> None:
     fitting: dict[str, Any] = {
         "cam_from_world": np.tile(np.eye(3, 4), (2, 1, 1)),
         "focal": np.ones((2, 2)),
@@ -184,5 +184,5 @@ def test_arrays_that_do_not_fit_are_refused(changed: dict[str, Any], said: str) 
         **{"min_angle": 0.0, "max_depth_error": None, "sigma_floor": 0.3, "error_to_sigma": 2.0},
     }
     assert len(_core.triangulate(**fitting)) == 6
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         _core.triangulate(**(fitting | changed))

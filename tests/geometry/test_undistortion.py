@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from colmap_av1.geometry.undistortion import on_pinholes, pinhole_camera, undistortion
 
 
-def test_undistorted_picture_shows_the_same() -> None:
+def test_undistorted_picture_matches_the_pinhole_camera() -> None:
     for k in (-0.12, 0.1):
         camera = pycolmap.Camera(
             camera_id=3, model="SIMPLE_RADIAL", width=320, height=240, params=[250, 160, 120, k]
@@ -30,7 +30,7 @@ def test_undistorted_picture_shows_the_same() -> None:
             weight = flat[near[0], near[1]]
             centre = [(weight * (n + 0.5)).sum() / weight.sum() for n in near[::-1]]
             assert np.allclose(centre, [x, y], atol=0.3)
-        # As wide as can be: some edge pixel comes from the source's edge.
+        # The field of view is maximal: some edge pixel comes from the edge of the source.
         wider = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=pinhole.params * 1)
         wider.params = [p * 0.98 for p in pinhole.params[:2]] + list(pinhole.params[2:])
         undistort_wider = undistortion(camera, wider)
@@ -46,7 +46,7 @@ def test_undistorted_picture_shows_the_same() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 96), st.integers(0, 60)), max_size=1100))
-def test_some_pixels_are_those_of_the_whole_undistorted_picture(at: list[tuple[int, int]]) -> None:
+def test_single_pixels_match_the_undistorted_picture(at: list[tuple[int, int]]) -> None:
     camera = pycolmap.Camera(
         camera_id=1, model="SIMPLE_RADIAL", width=97, height=61, params=[90, 48, 30, -0.1]
     )
