@@ -1,4 +1,4 @@
-"""The parser against exact block data: our own small set, the conformance kit, the suite."""
+"""The parser agrees with exact block data: our own streams, the conformance kit, the suite."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _suite_streams() -> list[Any]:
 
 
 def _or_absent(params: list[Any]) -> list[Any]:
-    absent = pytest.mark.skip(reason="the shared test data is not beside the checkout")
+    absent = pytest.mark.skip(reason="the shared test data is not next to the checkout")
     return params or [pytest.param(None, None, marks=absent, id="absent")]
 
 
@@ -74,13 +74,13 @@ def test_suite_is_exact(stream: Path, expected: Path) -> None:
     if "av1-1-b8-03-sizeup" in stream.name:
         found = [f for f in found if f.startswith("event")]  # several sequence headers
     if "019_vq_aom_ctest" in stream.name:
-        # The stored flag is 0 for a frame whose header sets it; everything read after it agrees.
+        # The expected flag is 0 for a frame whose header sets it; all later values agree.
         found = [f for f in found if "frame_refs_short_signaling" not in f]
     assert found == []
 
 
 @pytest.mark.shared
-def test_level_of_which_20_bits_leave_nothing(shared: Path) -> None:
-    """Such a level has a sign in the contexts of later blocks; without it the tile ends early."""
+def test_coefficient_level_whose_low_20_bits_are_zero(shared: Path) -> None:
+    """Its sign still affects the contexts of later blocks; without it the tile ends early."""
     (frame,) = read_motion(shared / "cases" / "325_tennis.ivf", ReadOptions(strict=True))
     assert frame.mi_size.shape == (2, 4)

@@ -1,4 +1,4 @@
-"""Damaged and hostile streams: an error of this package or the frames before the damage."""
+"""Damaged and hostile streams give an error of this package or the frames before the damage."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ _UNIT_FIELDS = (
 _TIMEOUT = 120  # seconds for all files of a test together; they take 2
 _MEGABYTE = 1 << 20
 
-# Files that give no frame. Where a demuxer gives up differs from one version of FFmpeg to
-# the next: before the first packet the file is no video, after it the stream is damaged.
+# Files without a readable frame. FFmpeg versions differ in where demuxing fails: before the first
+# packet the file is not a video, after it the stream is damaged.
 _NO_VIDEO = ("VideoError", "BitstreamError")
 _ERRORS = {
     **dict.fromkeys(
@@ -65,11 +65,11 @@ _ERRORS = {
     ),
     "huge_dimensions.ivf": ("LimitError",),
 }
-# Damage that the syntax does not show.
+# Damage that the syntax does not reveal.
 _SILENT = ("flip_frame_header_2.ivf", "duplicated_tu.ivf", "reserved_obu_types.ivf")
 
-# Reads files in a process of its own: a crash or a hang must not take the tests with it.
-# One line of JSON a file, written before the next is touched.
+# Reads files in a separate process, so that a crash or a hang does not stop the tests. Writes a
+# line of JSON for each file before it reads the next.
 _WORKER = """
 import gc, json, os, resource, sys, time, warnings
 sys.path[:0] = sys.argv[1].split(os.pathsep)
@@ -106,7 +106,7 @@ for path in sys.argv[2:]:
 
 
 def digest(fields: dict[str, NDArray[Any]]) -> str:
-    """Of a frame's unit arrays, whatever their shape and order in memory."""
+    """Digest of the unit arrays of a frame, independent of shape and memory order."""
     state = hashlib.sha256()
     for name in _UNIT_FIELDS:
         state.update(np.ascontiguousarray(fields[name]).tobytes())
@@ -118,7 +118,7 @@ def frame_digest(frame: FrameMotion) -> str:
 
 
 def read_apart(paths: list[Path]) -> dict[str, dict[str, Any]]:
-    """What a process of its own makes of the files, by name; a crash or hang fails the test."""
+    """Read the files in a separate process; a crash or a hang fails the test."""
     command = [sys.executable, "-c", _WORKER, TEST_PATHS, *map(str, paths)]
     run = subprocess.run(
         command,
@@ -160,7 +160,7 @@ def packets_until_damage(path: Path) -> list[bytes]:
 
 
 def intact_units(damaged: Path, source: Path) -> int:
-    """Number of temporal units at the start that the damage left as they were."""
+    """Number of undamaged temporal units at the start."""
     count = 0
     for got, want in zip(packets_until_damage(damaged), packets_until_damage(source), strict=False):
         if got != want:
@@ -181,7 +181,9 @@ def outcomes() -> dict[str, dict[str, Any]]:
 
 @pytest.mark.shared
 @pytest.mark.parametrize("bad", bad_files(), ids=lambda bad: bad["file"])
-def test_damaged_file(bad: dict[str, Any], outcomes: dict[str, dict[str, Any]]) -> None:
+def test_damaged_file_gives_the_expected_error_or_frames(
+    bad: dict[str, Any], outcomes: dict[str, dict[str, Any]]
+) -> None:
     name = bad["file"]
     outcome = outcomes[name]
     assert outcome["grown"] < 64 * _MEGABYTE
@@ -213,7 +215,7 @@ def test_damaged_file(bad: dict[str, Any], outcomes: dict[str, dict[str, Any]]) 
 
 
 def ivf(*units: bytes) -> bytes:
-    """An IVF file of the temporal units."""
+    """An IVF file that contains the temporal units."""
     header = struct.pack("<4sHH4sHHIIII", b"DKIF", 0, 32, b"AV01", 64, 64, 25, 1, len(units), 0)
     frames = (struct.pack("<IQ", len(unit), i) + unit for i, unit in enumerate(units))
     return header + b"".join(frames)
@@ -225,7 +227,7 @@ def obu(obu_type: int, payload: bytes) -> bytes:
 
 
 def bits(*fields: tuple[int, int]) -> bytes:
-    """Fields (width, value) of a header, then a one and zeros to the next byte."""
+    """Header fields (width, value), then trailing bits: a one, and zeros to the next byte."""
     text = "".join(f"{value:0{width}b}" for width, value in fields if width) + "1"
     text += "0" * (-len(text) % 8)
     return bytes(int(text[i : i + 8], 2) for i in range(0, len(text), 8))
@@ -248,7 +250,7 @@ def still_picture_sequence(width: int, height: int) -> bytes:
 def still_picture(width: int, height: int, tile_data: bytes) -> bytes:
     """A temporal unit with a still picture."""
     # disable_cdf_update, allow_screen_content_tools, render_and_frame_size_different, then
-    # uniform tile spacing with no increment; zeros are a valid value for all that follows.
+    # uniform tile spacing without an increment; zeros are valid for all following fields.
     frame = bytes([0b00010000]) + bytes(11)
     return obu(2, b"") + still_picture_sequence(width, height) + obu(6, frame + tile_data)
 
@@ -271,12 +273,12 @@ def test_declared_size_alone_costs_no_memory(
     large.write_bytes(ivf(still_picture(width, height, b"\0" * 40)))
     outcome = read_apart([small, large])["large.ivf"]
     assert outcome["error"] == error
-    # The largest accepted size costs at most its unit grid, 8 bytes a unit.
+    # The largest accepted size costs at most its unit grid, 8 bytes per unit.
     limit = 32 if error == "LimitError" else 32 + width * height / 16 * 8 / _MEGABYTE
     assert outcome["grown"] < limit * _MEGABYTE
 
 
-def test_limit_is_the_option_s() -> None:
+def test_max_frame_size_is_the_limit() -> None:
     stream = _DATA / "aq1.ivf"
     first = next(read_motion(stream))
     samples = first.width * first.height
@@ -286,7 +288,7 @@ def test_limit_is_the_option_s() -> None:
 
 
 def test_tile_groups_after_a_damaged_one_do_not_complete_the_frame() -> None:
-    # Two tiles of one superblock; a header with uniform spacing, one increment, base_q_idx 255.
+    # Two tiles of one superblock: a header with uniform spacing, one increment, base_q_idx 255.
     start = obu(2, b"") + still_picture_sequence(128, 64)
     start += obu(3, bytes([0b00011000, 255, 0, 0, 0, 0x80]))
     tile = b"\x07\x80"
@@ -310,11 +312,11 @@ def test_tile_groups_after_a_damaged_one_do_not_complete_the_frame() -> None:
     assert len(parser.take_events()) == 1
 
 
-# --- tiles that end otherwise than the specification demands -----------------------------------
+# --- tiles with trailing bits that violate the specification -----------------------------------
 
 
 def last_obu_type(unit: bytes) -> int:
-    """Type of the last OBU of a temporal unit whose OBUs all have a size."""
+    """Type of the last OBU of a temporal unit; all OBUs must have a size."""
     position = last = 0
     while position < len(unit):
         last = (unit[position] >> 3) & 15
@@ -332,9 +334,9 @@ def last_obu_type(unit: bytes) -> int:
 
 
 def with_other_trailing_bits(path: Path, num: int, output: Path) -> int:
-    """Write a stream with other bits at the end of the first frames that end a temporal unit.
+    """Write a stream with changed trailing bits in the first frames that end a temporal unit.
 
-    Returns the number of frames that are changed.
+    Returns the number of changed frames.
     """
     data = bytearray(path.read_bytes())
     position, changed = 32, 0
@@ -343,8 +345,8 @@ def with_other_trailing_bits(path: Path, num: int, output: Path) -> int:
         unit = data[position + 12 : position + 12 + size]
         position = end = position + 12 + size
         if last_obu_type(unit) == 6 and unit[-1]:  # OBU_FRAME ends with a tile
-            # Bits 10...0 become 01...1: of the values that give the last symbols the same range,
-            # encoders take the largest, so the next smaller one does as well.
+            # Bits 10...0 become 01...1. Encoders choose the largest value that gives the last
+            # symbols, so the next smaller one gives the same symbols.
             data[end - 1] -= 1
             changed += 1
     output.write_bytes(data)
@@ -352,7 +354,7 @@ def with_other_trailing_bits(path: Path, num: int, output: Path) -> int:
 
 
 def motion_of(path: Path, **options: Any) -> tuple[list[str], list[str]]:
-    """Digests of the frames, and warnings."""
+    """Digests of the frames, and the warnings."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         found = [frame_digest(frame) for frame in read_motion(path, ReadOptions(**options))]
@@ -360,16 +362,16 @@ def motion_of(path: Path, **options: Any) -> tuple[list[str], list[str]]:
 
 
 @pytest.mark.parametrize("num", [1, 99])
-def test_other_trailing_bits_are_read_as_decoders_read_them(tmp_path: Path, num: int) -> None:
+def test_wrong_trailing_bits_are_accepted_with_a_warning(tmp_path: Path, num: int) -> None:
     source, path = _DATA / "svt4_p6.ivf", tmp_path / "a.ivf"
     changed = with_other_trailing_bits(source, num, path)
     assert changed == 1 or 4 < changed < num
     wanted, no_warnings = motion_of(source)
     assert no_warnings == []
     for num_threads in (1, 4):
-        found, told = motion_of(path, num_threads=num_threads)
+        found, warned = motion_of(path, num_threads=num_threads)
         assert found == wanted
-        (line,) = told
+        (line,) = warned
         assert f"{changed} of {len(wanted)} frames" in line
     with pytest.raises(BitstreamError, match="bits"):
         motion_of(path, strict=True)
@@ -381,7 +383,7 @@ def test_other_trailing_bits_are_read_as_decoders_read_them(tmp_path: Path, num:
     assert pictures(path) == pictures(source)
 
 
-def test_tile_that_goes_on_after_its_symbols_is_damaged() -> None:
+def test_tile_with_data_after_its_symbols_is_damaged() -> None:
     start = obu(2, b"") + still_picture_sequence(64, 64)
     frame = obu(3, bytes([0b00011000, 255, 0, 0, 0, 0x80]))
     for tile, wrong in (
@@ -427,7 +429,7 @@ def undamaged() -> dict[Path, list[tuple[int, int, str]]]:
 
 @st.composite
 def damages(draw: st.DrawFn) -> tuple[Path, bytes, int]:
-    """A stream, its damaged file, and the number of its bytes before the damage."""
+    """A stream, its damaged content, and the number of bytes before the damage."""
     path = draw(st.sampled_from(_SMALL))
     data = path.read_bytes()
     start = draw(st.integers(0, len(data) - 1))
@@ -448,7 +450,7 @@ def damages(draw: st.DrawFn) -> tuple[Path, bytes, int]:
 
 
 def units_before(data: bytes, position: int) -> int:
-    """Number of temporal units of an IVF file that end at or before a position."""
+    """Number of temporal units of an IVF file that end before or at a position."""
     count, at = 0, 32
     while at + 12 <= len(data):
         at += 12 + struct.unpack_from("<I", data, at)[0]
@@ -468,7 +470,7 @@ _SETTINGS = settings(
 
 @_SETTINGS
 @given(damage=damages())
-def test_any_damage_leaves_the_frames_before_it(
+def test_frames_before_any_damage_are_read(
     damage: tuple[Path, bytes, int],
     undamaged: dict[Path, list[tuple[int, int, str]]],
     tmp_path: Path,
@@ -486,7 +488,7 @@ def test_any_damage_leaves_the_frames_before_it(
 
 @_SETTINGS
 @given(damage=damages())
-def test_parser_survives_any_damage_and_what_follows(
+def test_parser_recovers_after_any_damage(
     damage: tuple[Path, bytes, int], undamaged: dict[Path, list[tuple[int, int, str]]]
 ) -> None:
     source, data, position = damage
@@ -494,7 +496,7 @@ def test_parser_survives_any_damage_and_what_follows(
     parser = _core.Parser()
     found: list[tuple[int, str]] = []
     failed_at = None
-    # A frame that damage leaves open ends at a temporal delimiter, with an error.
+    # A temporal delimiter ends an incomplete frame with an error.
     delimiter = obu(2, b"")
     for index, unit in enumerate([*split_units(data), delimiter, *split_units(whole)]):
         try:
@@ -510,7 +512,7 @@ def test_parser_survives_any_damage_and_what_follows(
     assert failed_at is None or failed_at >= intact
     expected = undamaged[source]
     assert [f for f in found if f[0] < intact] == [(u, d) for u, _, d in expected if u < intact]
-    # The streams start with a key frame that forgets everything: the last reading is exact.
+    # The streams start with a key frame that resets the state, so the last reading is exact.
     assert [d for _, d in found[-len(expected) :]] == [d for _, _, d in expected]
 
 
@@ -531,7 +533,7 @@ def test_damage_before_the_first_frame_is_an_error(tmp_path: Path) -> None:
 
 
 def blank_frame(units: tuple[int, int], width: int, height: int) -> FrameMotion:
-    """A frame of still inter blocks whose width and height need not fit its units."""
+    """A frame of inter blocks without motion; its size need not fit its units."""
     header = {
         "show_frame": 1,
         "frame_width": width,
@@ -555,7 +557,7 @@ def blank_frame(units: tuple[int, int], width: int, height: int) -> FrameMotion:
 
 
 @pytest.mark.parametrize("size", [2**31 - 1, 2**31 - 3, 65537, 0, -1])
-def test_sizes_no_frame_has_are_refused(size: int) -> None:
+def test_invalid_frame_sizes_are_refused(size: int) -> None:
     for frame in (blank_frame((2, 2), size, 8), blank_frame((2, 2), 8, size)):
         with pytest.raises(ValueError, match="1 to 65536"):
             frame.displacement(0)
@@ -564,7 +566,7 @@ def test_sizes_no_frame_has_are_refused(size: int) -> None:
 
 
 @pytest.mark.parametrize("units", [(0, 0), (1, 2), (2, 1)])
-def test_a_picture_larger_than_its_units_is_refused(units: tuple[int, int]) -> None:
+def test_picture_larger_than_its_units_is_refused(units: tuple[int, int]) -> None:
     frame = blank_frame(units, 8, 8)
     with pytest.raises(ValueError, match="4x4"):
         frame.displacement(0)

@@ -40,7 +40,7 @@ def test_declarations_match_definitions():
 
 
 @pytest.mark.parametrize("file", ["default_cdfs.cc", "spec_tables.h"])
-def test_arrays_hold_as_many_values_as_stated(file):
+def test_arrays_have_the_stated_number_of_values(file):
     for name, (dims, values) in read_tables(file).items():
         size = 1
         for dim in dims:

@@ -10,7 +10,7 @@ from conftest import AV1, Encode, Ffmpeg, make_frames
 from colmap_av1.motion.info import read_info
 
 
-def test_good_stream(clip: Path) -> None:
+def test_good_stream_is_reported_as_good(clip: Path) -> None:
     report = read_info(clip)
     assert report.good
     assert (report.width, report.height, report.display.rotation) == (192, 128, 0)
@@ -50,7 +50,7 @@ def test_rotation_is_reported(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> Non
     ],
     ids=["intra", "key frames", "short", "still", "low rate"],
 )
-def test_poor_streams(
+def test_poor_streams_are_reported_with_a_reason(
     encode: Encode, tmp_path: Path, frames: np.ndarray, how: list[str], reason: str
 ) -> None:
     if reason == "rate":
@@ -60,8 +60,8 @@ def test_poor_streams(
     assert any(reason in r for r in report.reasons), report.reasons
 
 
-def test_frames_that_are_there_twice_move_all_the_same(encode: Encode, tmp_path: Path) -> None:
-    """As where a higher frame rate was made of a lower one, or a camera pauses."""
+def test_repeated_frames_do_not_make_a_stream_poor(encode: Encode, tmp_path: Path) -> None:
+    """Frames repeat after a conversion to a higher frame rate, or when a camera pauses."""
     frames = make_frames(16)
     for number, repeats in enumerate(
         (np.repeat(frames, 2, axis=0), frames[[*range(12), *[11] * 14]])
@@ -71,8 +71,8 @@ def test_frames_that_are_there_twice_move_all_the_same(encode: Encode, tmp_path:
         assert report.good, report.reasons
 
 
-def test_fast_turns(encode: Encode, tmp_path: Path) -> None:
-    """The picture moves by a tenth of its width in a fifth of the frames."""
+def test_fast_turns_are_reported(encode: Encode, tmp_path: Path) -> None:
+    """In a fifth of the frames the picture moves by a tenth of its width."""
     steps = np.where(np.arange(40) % 20 < 4, 20, 2)
     rng = np.random.default_rng(0)
     wall = cv2.GaussianBlur(rng.integers(0, 255, (128, 1000), np.uint8), (0, 0), 3)
@@ -85,7 +85,7 @@ def test_fast_turns(encode: Encode, tmp_path: Path) -> None:
     assert any("slowly" in reason for reason in report.reasons), report.reasons
 
 
-def test_a_change_of_size(encode: Encode, tmp_path: Path) -> None:
+def test_change_of_size_is_reported(encode: Encode, tmp_path: Path) -> None:
     frames = make_frames(12)
     one = encode(frames, tmp_path / "one.obu", *AV1)
     other = encode(frames[:, :96, :128].copy(), tmp_path / "other.obu", *AV1)

@@ -1,4 +1,4 @@
-"""Reading motion with threads: groups of frames that start at a key frame."""
+"""Threads read groups of frames that start at a key frame."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from colmap_av1 import BitstreamError, FrameMotion, ReadOptions, read_motion
 from colmap_av1.motion import reading
 from colmap_av1.video.container import open_stream
 
-# A picture that changes much, so that a frame is more than a few bytes
+# A picture with much change, so that frames have more than a few bytes
 SOURCE = "testsrc2=size=320x192:rate=25,noise=alls=12:allf=t"
 ENCODERS = {
-    # Low delay and hidden frames; a key frame every 8 and every 7 frames, the last group short
+    # Low delay and hidden frames; a key frame every 8 or 7 frames, with a short last group
     "aom.mp4": "-c:v libaom-av1 -cpu-used 8 -usage realtime -lag-in-frames 0 -g 8 -frames:v 28",
     "hidden.mkv": "-c:v libaom-av1 -cpu-used 8 -lag-in-frames 8 -g 7 -keyint_min 7 -frames:v 25",
     "tiles.obu": "-c:v libaom-av1 -cpu-used 8 -usage realtime -tiles 2x1 -g 9 -frames:v 20",
@@ -54,7 +54,7 @@ def assert_same(found: FrameMotion, expected: FrameMotion) -> None:
 
 
 def read(video: Path, num_threads: int, strict: bool = False) -> tuple[list[FrameMotion], str]:
-    """The frames, and the words of the warning or error that ended them."""
+    """The frames, and the message of the warning or error at the end."""
     frames: list[FrameMotion] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -67,7 +67,9 @@ def read(video: Path, num_threads: int, strict: bool = False) -> tuple[list[Fram
 
 @pytest.mark.parametrize("name", ENCODERS)
 @pytest.mark.parametrize("num_threads", [2, 3, 16])
-def test_threads_change_nothing(clips: dict[str, Path], name: str, num_threads: int) -> None:
+def test_result_does_not_depend_on_threads(
+    clips: dict[str, Path], name: str, num_threads: int
+) -> None:
     expected, words = read(clips[name], 1)
     keys = [f for f in expected if f.header["frame_type"] == 0 and f.header["show_frame"]]
     assert len(keys) >= 3
@@ -94,7 +96,7 @@ def test_groups_are_read_by_several_threads(
     assert len(used) == 4  # one more reads the headers
 
 
-def test_a_reader_waits_where_frames_are_not_used(
+def test_reader_waits_until_frames_are_used(
     clips: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected, _ = read(clips["aom.mp4"], 1)
@@ -117,10 +119,10 @@ def test_threads_end_with_the_iterator(clips: dict[str, Path], used: int) -> Non
 
 @pytest.mark.parametrize("damaged", [5, 8, 13, 27])
 @pytest.mark.parametrize("strict", [False, True])
-def test_damage_ends_at_the_same_place(
+def test_damage_is_found_at_the_same_place_with_threads(
     clips: dict[str, Path], tmp_path: Path, damaged: int, strict: bool
 ) -> None:
-    """Damage inside a frame's blocks and of a whole packet, in the first, a middle, the last."""
+    """Damages the blocks of a frame or a whole packet, in the first, middle and last group."""
     source = clips["aom.mp4"]
     data = bytearray(source.read_bytes())
     with open_stream(source) as stream:
@@ -143,7 +145,7 @@ def test_damage_ends_at_the_same_place(
                 assert_same(a, b)
 
 
-# Thread stacks of 1 GB, and room for less: no thread can be started.
+# With thread stacks of 1 GB and less address space, no thread can be started.
 _WITHOUT_THREADS = """
 import resource, sys
 from pathlib import Path
@@ -158,7 +160,7 @@ print(len(parser.take_events()))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits address space as Linux does")
-def test_tiles_are_read_where_no_thread_can_be_started(tmp_path: Path) -> None:
+def test_tiles_are_read_without_threads_if_none_can_be_started(tmp_path: Path) -> None:
     video = tmp_path / "tiles.obu"
     ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "lavfi", "-i", SOURCE]
     words = "-c:v libaom-av1 -cpu-used 8 -usage realtime -tiles 2x1 -crf 5 -frames:v 3"
@@ -177,7 +179,7 @@ def test_tiles_are_read_where_no_thread_can_be_started(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("num_threads", [1, 4])
-def test_a_script_that_ends_while_it_reads(clip: Path, num_threads: int) -> None:
+def test_script_may_exit_while_reading(clip: Path, num_threads: int) -> None:
     code = """
 import sys
 from colmap_av1 import ReadOptions, read_motion
@@ -186,6 +188,6 @@ frame = next(left_open)
 raise SystemExit(3)
 """
     words = [sys.executable, "-c", code, str(clip), str(num_threads)]
-    for _ in range(5):  # one in ten was ended by a signal
+    for _ in range(5):  # one run in ten used to be killed by a signal
         done = subprocess.run(words, cwd=clip.parent, capture_output=True, text=True, check=False)
         assert (done.returncode, done.stderr) == (3, "")

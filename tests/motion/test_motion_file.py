@@ -25,7 +25,9 @@ def check_frame(frame: FrameMotion, stored: dict[str, np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize("ending", ["npz", "h5"])
-def test_files_hold_every_field_of_every_frame(clip: Path, tmp_path: Path, ending: str) -> None:
+def test_motion_files_contain_every_field_of_every_frame(
+    clip: Path, tmp_path: Path, ending: str
+) -> None:
     output = tmp_path / f"m.{ending}"
     done: list[int] = []
     assert export_motion(clip, output, progress=lambda _, n, total: done.append(n)) == 16
