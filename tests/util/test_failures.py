@@ -1,4 +1,4 @@
-"""Kinds of failures, and which of them another attempt may not have."""
+"""Failures are classified by reason, and by whether another attempt may succeed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from colmap_av1.util.failures import failure_of
         (KeyError("x"), "defect", False),
     ],
 )
-def test_failures(error: Exception, reason: str, transient: bool) -> None:
+def test_failures_are_classified(error: Exception, reason: str, transient: bool) -> None:
     found = failure_of(error)
     assert (found.reason, found.transient) == (reason, transient)
     wrapped = ModelError("cannot be written")

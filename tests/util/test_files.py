@@ -32,7 +32,7 @@ def names_in(folder: Path) -> list[str]:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder to work in, with an input file, a folder of inputs and a file of nobody."""
+    """A working folder with an input file, a folder of inputs and an unrelated file."""
     (tmp_path / "images" / "far").mkdir(parents=True)
     for name in ("video.mp4", "images/a.png", "notes.txt"):
         (tmp_path / name).write_text(name)
@@ -40,7 +40,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_what_exists_is_refused_unless_it_may_be_overwritten(folder: Path) -> None:
+def test_existing_files_are_refused_without_overwrite(folder: Path) -> None:
     check_new_file(Path("new.txt"), ["video.mp4", "absent", None])
     check_new_file(Path("notes.txt"), ["video.mp4"], overwrite=True)
     with pytest.raises(OptionError, match="--overwrite"):
@@ -51,7 +51,7 @@ def test_what_exists_is_refused_unless_it_may_be_overwritten(folder: Path) -> No
 
 
 @pytest.mark.parametrize("output", ["video.mp4", "images/../video.mp4", "link", "hard"])
-def test_an_input_is_refused_by_any_name(folder: Path, output: str) -> None:
+def test_input_is_refused_as_output_under_any_name(folder: Path, output: str) -> None:
     (folder / "link").symlink_to("video.mp4")
     (folder / "hard").hardlink_to("video.mp4")
     for path in (Path(output), folder / output):
@@ -59,7 +59,7 @@ def test_an_input_is_refused_by_any_name(folder: Path, output: str) -> None:
             check_new_file(path, ["video.mp4"], overwrite=True)
 
 
-def test_folders_that_are_or_hold_an_input(folder: Path) -> None:
+def test_folders_that_contain_an_input_are_refused(folder: Path) -> None:
     (folder / "here").symlink_to(".", target_is_directory=True)
     check_apart(Path("new"), ["video.mp4", "images", None])
     check_apart(Path("images/far/new"), ["video.mp4", "images"])
@@ -70,7 +70,7 @@ def test_folders_that_are_or_hold_an_input(folder: Path) -> None:
         check_apart(Path("absent"), [folder / "absent" / "images"])
 
 
-def test_a_folder_appears_when_whole(tmp_path: Path) -> None:
+def test_folder_appears_when_complete(tmp_path: Path) -> None:
     output = tmp_path / "new" / "model"
     with whole_folder(output) as partial:
         (partial / "points").write_text("1")
@@ -85,7 +85,7 @@ def test_a_folder_appears_when_whole(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["new"]
 
 
-def test_a_folder_that_is_there_gets_the_content(tmp_path: Path) -> None:
+def test_existing_folder_is_filled(tmp_path: Path) -> None:
     output = tmp_path / "model"
     output.mkdir()
     (tmp_path / "link").symlink_to("model")
@@ -103,7 +103,7 @@ def test_a_folder_that_is_there_gets_the_content(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("is_there", [False, True])
-def test_a_file_that_another_program_writes_meanwhile_stays(tmp_path: Path, is_there: bool) -> None:
+def test_file_written_meanwhile_by_another_program_is_kept(tmp_path: Path, is_there: bool) -> None:
     output = tmp_path / "a.mp4"
     if is_there:
         output.write_text("old")
@@ -121,13 +121,13 @@ def test_a_file_that_another_program_writes_meanwhile_stays(tmp_path: Path, is_t
 
 @locks
 @pytest.mark.parametrize("how", ["whole_file", "whole_folder", "scratch_folder"])
-def test_what_the_killed_left_is_removed(how: str, tmp_path: Path) -> None:
+def test_leftovers_of_killed_processes_are_removed(how: str, tmp_path: Path) -> None:
     for name in ("model [1]", "other"):
         kill_while_writing(how, tmp_path / name)
     assert len(names_in(tmp_path)) == 2
     with whole_file(tmp_path / "model [1]"):
         remove_leftovers(tmp_path, "model [1]")
-        # What is being written stays, also what another thread or process writes.
+        # Files that are being written are kept, also those of other threads or processes.
         assert len(names_in(tmp_path)) == 2
     assert [name for name in names_in(tmp_path) if "other" not in name] == ["model [1]"]
     remove_leftovers(tmp_path)
@@ -136,8 +136,8 @@ def test_what_the_killed_left_is_removed(how: str, tmp_path: Path) -> None:
 
 @locks
 @pytest.mark.parametrize("how", [whole_file, scratch_folder])
-def test_what_is_being_made_is_no_leftover(how: Callable[[Path], Any], tmp_path: Path) -> None:
-    """Shards of a batch begin at once in one folder, and each looks for leftovers there."""
+def test_files_being_written_are_not_leftovers(how: Callable[[Path], Any], tmp_path: Path) -> None:
+    """Shards of a batch start at the same time in one folder, and each removes leftovers there."""
     ended = threading.Event()
 
     def look() -> None:
@@ -157,8 +157,8 @@ def test_what_is_being_made_is_no_leftover(how: Callable[[Path], Any], tmp_path:
 
 
 @locks
-def test_what_others_made_stays(tmp_path: Path) -> None:
-    """Also where its name looks as if a process that has ended had left it."""
+def test_files_of_other_programs_are_kept(tmp_path: Path) -> None:
+    """Even if their names look like leftovers."""
     others = [".model.1.partial", ".model.99999999999999999999999.partial", ".model.partial"]
     others += [".model.x.partial", ".model.colmap-av1-0000ffffffff.partial"]
     for name in others:
@@ -174,7 +174,7 @@ def test_what_others_made_stays(tmp_path: Path) -> None:
 
 @locks
 @pytest.mark.parametrize("steps", range(9))
-def test_a_replacement_that_is_killed_loses_neither_content(steps: int, tmp_path: Path) -> None:
+def test_killed_replacement_keeps_the_old_or_new_content(steps: int, tmp_path: Path) -> None:
     output = tmp_path / "model"
     output.mkdir()
     old, new = {"a": "old", "b": "old"}, {"a": "new", "c": "new"}
@@ -187,7 +187,7 @@ def test_a_replacement_that_is_killed_loses_neither_content(steps: int, tmp_path
 
 
 @locks
-def test_what_a_user_adds_to_a_folder_half_replaced_stays(tmp_path: Path) -> None:
+def test_files_added_to_a_half_replaced_folder_are_kept(tmp_path: Path) -> None:
     output = tmp_path / "model"
     output.mkdir()
     (output / "a").write_text("old")
@@ -199,7 +199,7 @@ def test_what_a_user_adds_to_a_folder_half_replaced_stays(tmp_path: Path) -> Non
     assert sorted(texts) == ["mine", "old"]
 
 
-def test_a_folder_with_other_files_is_not_replaced(tmp_path: Path) -> None:
+def test_folder_with_other_files_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "a.bin").touch()
     own = re.compile(r"\w+\.bin")
@@ -212,7 +212,7 @@ def test_a_folder_with_other_files_is_not_replaced(tmp_path: Path) -> None:
 
 
 @locks
-def test_one_run_at_a_time(tmp_path: Path) -> None:
+def test_second_run_in_the_same_folder_is_refused(tmp_path: Path) -> None:
     output = tmp_path / "out"
     with open_stages(output, "a"):
         with (

@@ -26,7 +26,7 @@ except OSError as error:
 """
 
 
-def test_groups_and_what_is_written(tmp_path: Path) -> None:
+def test_hdf5_groups_and_datasets_are_written(tmp_path: Path) -> None:
     for name in ("a", "b"):
         with new_hdf5(tmp_path / name) as write:
             write("x/y/z", np.arange(70_000)).attrs["unit"] = 2.0
@@ -40,7 +40,7 @@ def test_groups_and_what_is_written(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="files have no limits there")
 @pytest.mark.parametrize("size", [2, 50, 5000, 100_000])
-def test_full_disk(size: int, tmp_path: Path) -> None:
+def test_full_disk_is_reported(size: int, tmp_path: Path) -> None:
     command = [sys.executable, "-c", FILL_THE_DISK, str(tmp_path / "a"), str(size)]
     run = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert run.returncode == 0

@@ -1,4 +1,4 @@
-"""Memory of processes."""
+"""Memory use of processes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from colmap_av1.util.memory import give_back_free_memory
 
 _MEGABYTE = 1 << 20
-# Arrays of a megabyte, every second of which is freed once larger ones have been: C keeps them.
+# Frees every second of some arrays of 1 MB after larger ones; the C library keeps such memory.
 _FREED = """
 import os
 from pathlib import Path
@@ -31,10 +31,12 @@ print(before - resident_memory())
 """
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries do it themselves")
-def test_free_memory_goes_back(tmp_path: Path) -> None:
+@pytest.mark.skipif(
+    platform.libc_ver()[0] != "glibc", reason="other C libraries return memory themselves"
+)
+def test_free_memory_is_returned_to_the_system(tmp_path: Path) -> None:
     run = [sys.executable, "-c", _FREED]
-    # From elsewhere: the sources in the working folder have no core.
+    # Run in another folder, because the sources in the working folder lack the extension.
     done = subprocess.run(run, capture_output=True, text=True, check=True, cwd=tmp_path)
     assert int(done.stdout) > 50 * _MEGABYTE
-    give_back_free_memory()  # nothing to give back is no error
+    give_back_free_memory()  # does nothing if there is none

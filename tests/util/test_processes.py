@@ -33,17 +33,19 @@ command = f"{shlex.join([sys.executable, '-c', child])} && echo not reached"
 subprocess.Popen(bound_group(["sh", "-c", command]))
 time.sleep(60)
 """
-linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends children so")
+linux = pytest.mark.skipif(
+    sys.platform != "linux", reason="only Linux can end children with their parent"
+)
 
 
 def is_running(process: int) -> bool:
-    try:  # what has ended and is not waited for has no words left
+    try:  # a zombie has an empty command line
         return Path(f"/proc/{process}/cmdline").read_bytes() != b""
     except OSError:
         return False
 
 
-def test_a_bound_process_is_the_one_asked_for() -> None:
+def test_bound_process_runs_the_command() -> None:
     program = "import sys; print(sys.argv[1:]); sys.exit(3)"
     words = ["a b", "", "-c", "'", "$x"]
     run = subprocess.run(
@@ -53,13 +55,13 @@ def test_a_bound_process_is_the_one_asked_for() -> None:
     assert run.returncode == 3
 
 
-def test_a_program_without_a_folder_is_looked_for() -> None:
+def test_bound_program_is_searched_in_the_path() -> None:
     run = subprocess.run(bound(["echo", "here"]), capture_output=True, text=True, check=True)
     assert run.stdout == "here\n"
 
 
 @linux
-def test_a_bound_group_runs_what_is_asked_for() -> None:
+def test_bound_group_runs_the_command() -> None:
     words = bound_group(["sh", "-c", "echo \"$1\" '$1' && exit 3", "sh", "a  b; $(echo no)"])
     run = subprocess.run(words, capture_output=True, text=True, check=False)
     assert run.stdout == "a  b; $(echo no) $1\n"
@@ -71,7 +73,7 @@ def test_a_bound_group_runs_what_is_asked_for() -> None:
 
 
 @linux
-def test_nothing_that_a_bound_group_started_outlives_it() -> None:
+def test_children_of_a_bound_group_end_with_it() -> None:
     words = bound_group(["sh", "-c", "sleep 60 & echo $!"])
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as shell:
         assert shell.stdout is not None
@@ -89,7 +91,7 @@ def wait_for_end(process: int) -> None:
 
 @linux
 @pytest.mark.parametrize("program", [BOUND, BINDING, GROUP], ids=["bound", "binding", "group"])
-def test_a_bound_process_ends_with_a_killed_one(program: str, tmp_path: Path) -> None:
+def test_bound_process_ends_when_its_parent_is_killed(program: str, tmp_path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, cwd=tmp_path
     ) as starter:

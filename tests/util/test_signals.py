@@ -12,26 +12,28 @@ import pytest
 
 from colmap_av1.util.signals import ending_in_order
 
-# Shells let what they start in the background ignore interrupts, and nohup that the terminal hangs
-# up; both are passed on.
+# Shells start background processes with interrupts ignored, and nohup with hang-ups ignored. Child
+# processes inherit this.
 SETTING = (
     "import os, signal, sys\n"
     "for number in {numbers}: signal.signal(number, signal.{action})\n"
     "os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
 )
-HEEDING = SETTING.format(numbers="(signal.SIGINT, signal.SIGHUP)", action="SIG_DFL")
-IGNORING = SETTING.format(numbers="(signal.SIGINT, signal.SIGTERM)", action="SIG_IGN")
-# As pip writes it.
+DEFAULT_SIGNALS = SETTING.format(numbers="(signal.SIGINT, signal.SIGHUP)", action="SIG_DFL")
+IGNORED_SIGNALS = SETTING.format(numbers="(signal.SIGINT, signal.SIGTERM)", action="SIG_IGN")
+# The script that pip installs.
 SCRIPT = (
     "import sys\nfrom colmap_av1.__main__ import main\n"
     "if __name__ == '__main__':\n    sys.exit(main())"
 )
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals end otherwise there")
+pytestmark = pytest.mark.skipif(
+    sys.platform == "win32", reason="signals end processes differently there"
+)
 
 
 def end_while_importing(words: list[str], number: int, folder: Path, after: str) -> tuple[int, str]:
-    """Status of a program that gets a signal while it imports, and what it prints."""
+    """Exit status and output of a program that gets a signal while it imports modules."""
     command = [sys.executable, "-c", words[0], "-X", "importtime", *words[1:]]
     with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
@@ -40,34 +42,34 @@ def end_while_importing(words: list[str], number: int, folder: Path, after: str)
                 break
         process.send_signal(number)
         rest = process.stderr.read().splitlines()
-    said = [line for line in rest if not line.startswith("import time:")]
-    return process.returncode, "\n".join(said)
+    output = [line for line in rest if not line.startswith("import time:")]
+    return process.returncode, "\n".join(output)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("start", ["module", "script"])
-def test_signal_during_the_imports(tmp_path: Path, start: str, number: int) -> None:
+def test_signal_during_imports_ends_the_program(tmp_path: Path, start: str, number: int) -> None:
     (tmp_path / "colmap-av1").write_text(SCRIPT)
     program = ["-m", "colmap_av1"] if start == "module" else [str(tmp_path / "colmap-av1")]
-    words = [HEEDING, *program, "--version"]
+    words = [DEFAULT_SIGNALS, *program, "--version"]
     after = "colmap_av1.cli.parser"
     assert end_while_importing(words, number, tmp_path, after) == (128 + number, "")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_after_pycolmap_has_set_its_own_handler(tmp_path: Path, number: int) -> None:
-    words = [HEEDING, "-m", "colmap_av1", "check", "--database", "none"]
-    status, said = end_while_importing(words, number, tmp_path, "pycolmap")
+def test_signal_handlers_of_pycolmap_are_replaced(tmp_path: Path, number: int) -> None:
+    words = [DEFAULT_SIGNALS, "-m", "colmap_av1", "check", "--database", "none"]
+    status, output = end_while_importing(words, number, tmp_path, "pycolmap")
     assert status == 128 + number
-    assert "Traceback" not in said
-    assert "@ " not in said  # a stack trace of C++
+    assert "Traceback" not in output
+    assert "@ " not in output  # a C++ stack trace
 
 
-def test_signal_that_pycolmap_must_not_heed_either(tmp_path: Path) -> None:
-    words = [IGNORING, "-m", "colmap_av1", "check", "--database", "none"]
-    status, said = end_while_importing(words, signal.SIGTERM, tmp_path, "pycolmap")
+def test_ignored_signal_stays_ignored_after_importing_pycolmap(tmp_path: Path) -> None:
+    words = [IGNORED_SIGNALS, "-m", "colmap_av1", "check", "--database", "none"]
+    status, output = end_while_importing(words, signal.SIGTERM, tmp_path, "pycolmap")
     assert status == 2
-    assert said.startswith("colmap-av1: error: none: ")
+    assert output.startswith("colmap-av1: error: none: ")
 
 
 MEASURING = """
@@ -81,19 +83,19 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists children so")
-def test_interrupt_of_a_group_while_a_process_of_it_starts(tmp_path: Path) -> None:
-    words = [sys.executable, "-c", HEEDING, "-c", MEASURING]
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists children in /proc")
+def test_interrupt_of_a_process_group_while_a_child_starts(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", DEFAULT_SIGNALS, "-c", MEASURING]
     with subprocess.Popen(
         words, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
         deadline = time.monotonic() + 60
-        # The first one watches shared memory, and ignores interrupts.
+        # The first child tracks shared memory and ignores interrupts.
         while len(children.read_text().split()) < 2:
             assert time.monotonic() < deadline
             time.sleep(0.005)
-        time.sleep(0.1)  # all signals wait while it is forked
+        time.sleep(0.1)  # signals are blocked during the fork
         child = Path("/proc") / children.read_text().split()[1]
         lines = dict(line.split(":\t") for line in (child / "status").read_text().splitlines())
         os.killpg(process.pid, signal.SIGINT)
@@ -102,14 +104,14 @@ def test_interrupt_of_a_group_while_a_process_of_it_starts(tmp_path: Path) -> No
     assert process.returncode == 130
 
 
-def test_ignored_signal_during_the_imports(tmp_path: Path) -> None:
-    words = [IGNORING, "-m", "colmap_av1", "info", "--video", "none.mp4"]
-    status, said = end_while_importing(words, signal.SIGINT, tmp_path, "numpy.version")
+def test_ignored_signal_during_imports_stays_ignored(tmp_path: Path) -> None:
+    words = [IGNORED_SIGNALS, "-m", "colmap_av1", "info", "--video", "none.mp4"]
+    status, output = end_while_importing(words, signal.SIGINT, tmp_path, "numpy.version")
     assert status == 2
-    assert "none.mp4" in said
+    assert "none.mp4" in output
 
 
-def test_handlers_within_and_after() -> None:
+def test_signal_handlers_are_restored() -> None:
     before = {n: signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGHUP)}
     with pytest.raises(SystemExit) as end, ending_in_order():
         signal.raise_signal(signal.SIGTERM)
@@ -117,7 +119,7 @@ def test_handlers_within_and_after() -> None:
     assert {n: signal.getsignal(n) for n in before} == before
 
 
-def test_threads_leave_handlers_alone() -> None:
+def test_signal_handlers_are_not_changed_in_other_threads() -> None:
     def run() -> None:
         with ending_in_order():
             within.append(signal.getsignal(signal.SIGTERM))

@@ -29,7 +29,7 @@ class Found:
 
 @dataclass
 class Twice:
-    """A stage of either kind in a folder, and how often it was run."""
+    """A stage of either kind in a folder, with a count of its runs."""
 
     folder: Path
     run: Callable[..., Kept]
@@ -41,7 +41,7 @@ class Twice:
 
 @pytest.fixture(params=["aside", "in place"])
 def stage(request: pytest.FixtureRequest, tmp_path: Path) -> Twice:
-    """A stage that makes an .npz file and two images, and has been run."""
+    """A stage that writes an .npz file and two images and was run once."""
 
     def make(folder: Path) -> Found:
         twice.calls += 1
@@ -93,7 +93,7 @@ def check_resumed(stage: Twice) -> None:
 
 
 def check_made_again(stage: Twice) -> None:
-    """The stage is run once more, and its products are what they were."""
+    """Check that the stage runs once more and gives the same products."""
     before = stage.calls
     again = stage.run()
     assert not again.resumed
@@ -105,7 +105,7 @@ def check_made_again(stage: Twice) -> None:
     check_resumed(stage)
 
 
-def test_a_finished_stage_is_not_run_again(stage: Twice) -> None:
+def test_finished_stage_is_not_run_again(stage: Twice) -> None:
     written = [p.stat().st_mtime_ns for p in stage.products]
     first = stage.run()
     assert stage.run() == first
@@ -116,7 +116,7 @@ def test_a_finished_stage_is_not_run_again(stage: Twice) -> None:
     assert not stage.run().resumed
 
 
-def test_a_stage_that_is_stopped_is_run_again(stage: Twice) -> None:
+def test_interrupted_stage_is_run_again(stage: Twice) -> None:
     stage.stop = True
     with pytest.raises(KeyboardInterrupt):
         stage.run("other")
@@ -126,14 +126,14 @@ def test_a_stage_that_is_stopped_is_run_again(stage: Twice) -> None:
 
 
 def overwrite(path: Path) -> None:
-    """Other bytes, as many, under the old date."""
+    """Write other content of the same length, and keep the date."""
     status, content = path.stat(), path.read_bytes()
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
 
 
 @pytest.mark.parametrize("index", range(3))
-def test_products_that_are_damaged_are_made_again(stage: Twice, index: int) -> None:
+def test_damaged_products_are_made_again(stage: Twice, index: int) -> None:
     product = stage.products[index]
     product.unlink()
     check_made_again(stage)
@@ -146,10 +146,10 @@ def test_products_that_are_damaged_are_made_again(stage: Twice, index: int) -> N
     check_made_again(stage)
 
 
-def test_products_of_long_ago_are_checked_by_their_dates(
+def test_old_products_are_checked_by_their_dates(
     stage: Twice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They are not read; a change under the old date is noticed all the same."""
+    """They are not read, but a change that keeps the date is noticed."""
     now = time.time_ns()
     monkeypatch.setattr(digests.time, "time_ns", lambda: now + 10_000_000_000)
     stage.run("long ago")
@@ -171,7 +171,7 @@ def test_products_of_long_ago_are_checked_by_their_dates(
         assert not stage.run("long ago").resumed
 
 
-def test_a_copy_is_taken_over_and_more_files_do_not_matter(stage: Twice, tmp_path: Path) -> None:
+def test_copied_folder_with_additional_files_is_resumed(stage: Twice, tmp_path: Path) -> None:
     (stage.folder / "images" / "c.png").touch()
     shutil.copytree(stage.folder, tmp_path / "copy")
     shutil.rmtree(stage.folder)
@@ -197,7 +197,7 @@ def test_a_copy_is_taken_over_and_more_files_do_not_matter(stage: Twice, tmp_pat
         lambda text: text.replace('"found": 3', '"found": 4'),
     ],
 )
-def test_a_record_that_is_damaged_is_made_again(stage: Twice, damage: Callable[[str], str]) -> None:
+def test_damaged_record_is_made_again(stage: Twice, damage: Callable[[str], str]) -> None:
     stage.record.write_text(damage(stage.record.read_text()))
     check_made_again(stage)
     stage.record.write_bytes(b"\xff\xfe" + stage.record.read_bytes())
@@ -219,8 +219,8 @@ def test_a_record_that_is_damaged_is_made_again(stage: Twice, damage: Callable[[
         {"result": None, "files": {}},
     ],
 )
-def test_a_record_that_was_made_to_mislead(tmp_path: Path, changes: dict[str, object]) -> None:
-    """Its digest fits its content, and its key the input."""
+def test_forged_record_is_not_trusted(tmp_path: Path, changes: dict[str, object]) -> None:
+    """The digest and the key of the record are correct."""
     output = tmp_path / "out"
     run_with(output, 1, ["images/a.png"])
     record = output / ".stages" / "a.json"
@@ -232,7 +232,7 @@ def test_a_record_that_was_made_to_mislead(tmp_path: Path, changes: dict[str, ob
     assert texts(output) == {"images/a.png": "1"}
 
 
-def test_what_has_no_effect_redoes_nothing(stage: Twice) -> None:
+def test_options_without_effect_do_not_rerun_a_stage(stage: Twice) -> None:
     options = MatchOptions()
     assert not stage.run(options).resumed
     threads = replace(options, run=RunOptions(num_threads=7), read=ReadOptions(num_threads=3))
@@ -242,7 +242,7 @@ def test_what_has_no_effect_redoes_nothing(stage: Twice) -> None:
     assert not stage.run(MapOptions(num_threads=2)).resumed  # changes the last digits
 
 
-def test_threads_count_where_time_is_measured(tmp_path: Path) -> None:
+def test_number_of_threads_reruns_a_timed_stage(tmp_path: Path) -> None:
     def run(num_threads: int) -> bool:
         options = MatchOptions(run=RunOptions(num_threads=num_threads))
         return run_stage_in(tmp_path / "a", [options], dict, products=[], timed=True).resumed
@@ -250,7 +250,7 @@ def test_threads_count_where_time_is_measured(tmp_path: Path) -> None:
     assert [run(1), run(1), run(2)] == [False, True, False]
 
 
-def test_an_upgrade_redoes(stage: Twice, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_upgrade_reruns_a_stage(stage: Twice, monkeypatch: pytest.MonkeyPatch) -> None:
     check_resumed(stage)
     for name in ("code_digest", "package_version"):
         with monkeypatch.context() as patch:
@@ -259,7 +259,7 @@ def test_an_upgrade_redoes(stage: Twice, monkeypatch: pytest.MonkeyPatch) -> Non
         check_made_again(stage)
 
 
-def test_code_counts_compiled_or_not_whatever_its_room(
+def test_code_digest_depends_on_all_code_in_the_folders(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(digests, "PACKAGE", tmp_path)
@@ -288,14 +288,14 @@ def test_code_counts_compiled_or_not_whatever_its_room(
         code_digest.cache_clear()
 
 
-def test_all_code_of_the_package_counts() -> None:
+def test_code_digest_includes_the_compiled_core() -> None:
     files = {p for p in digests.PACKAGE.rglob("*") if p.suffix in digests._CODE}
     assert {p.name for p in files} >= {"match.py", "stages.py", "tables.py"}
     assert any(re.match(r"_core\..*(so|pyd)$", p.name) for p in files)
     assert digests.PACKAGE.name == "colmap_av1"
 
 
-def test_values_are_told_apart() -> None:
+def test_different_values_have_different_digests() -> None:
     values: list[Any] = [
         *(None, True, 1, 1.0, "1", (1,), ("1",), [[1]], {"1": 1}, {1: 1}, (), {}, "", "a,b"),
         *(("a", "b"), MatchOptions(), ReadOptions(), {}.fromkeys("ab"), ("None",), (None,)),
@@ -309,13 +309,11 @@ def test_values_are_told_apart() -> None:
         digest_of([np.arange(3)])
 
 
-def test_a_file_is_read_once_while_it_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unchanged_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "video.mp4"
     path.write_bytes(b"1")
     first = file_digest(path)
-    path.write_bytes(b"2")  # at once: the date may be the same
+    path.write_bytes(b"2")  # written at once, so the date may be the same
     assert file_digest(path) != first
     now = time.time_ns()
     monkeypatch.setattr(digests.time, "time_ns", lambda: now + 10_000_000_000)
@@ -327,7 +325,7 @@ def test_a_file_is_read_once_while_it_stays(
 
 
 def run_with(output: Path, key: int, names: list[str]) -> Kept:
-    """A stage that makes the given files, which hold the key."""
+    """Run a stage that writes the key to the given files."""
 
     def make(folder: Path) -> Found:
         for name in names:
@@ -345,7 +343,7 @@ def texts(folder: Path) -> dict[str, str]:
     return {p.relative_to(folder).as_posix(): p.read_text() for p in files}
 
 
-def test_another_run_replaces_its_own_files_alone(tmp_path: Path) -> None:
+def test_second_run_only_replaces_files_of_the_first(tmp_path: Path) -> None:
     output = tmp_path / "out"
     run_with(output, 1, ["images/0.png", "images/1.png", "sparse/0/points3D.bin"])
     mine = ["images/mine.png", "sparse/0/points3D.ply", "sparse/1/points3D.bin"]
@@ -357,7 +355,7 @@ def test_another_run_replaces_its_own_files_alone(tmp_path: Path) -> None:
     assert texts(output) == {**theirs, **dict.fromkeys(mine, "mine")}
 
 
-def test_a_file_of_a_user_in_the_way_is_refused(tmp_path: Path) -> None:
+def test_existing_file_of_the_user_is_refused(tmp_path: Path) -> None:
     output = tmp_path / "out"
     run_with(output, 1, ["images/0.png"])
     (output / "images" / "1.png").write_text("mine")
@@ -370,7 +368,7 @@ def test_a_file_of_a_user_in_the_way_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stopped_at", range(1, 5))
-def test_a_run_that_is_stopped_between_its_files_is_made_up_for(
+def test_run_interrupted_between_files_is_completed(
     stopped_at: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     output = tmp_path / "out"
@@ -393,7 +391,7 @@ def test_a_run_that_is_stopped_between_its_files_is_made_up_for(
         assert texts(output) == wanted
 
 
-def test_a_record_of_another_origin_removes_nothing_elsewhere(tmp_path: Path) -> None:
+def test_forged_record_removes_no_files_elsewhere(tmp_path: Path) -> None:
     output = tmp_path / "out"
     run_with(output, 1, ["images/0.png"])
     (tmp_path / "mine.txt").write_text("mine")
