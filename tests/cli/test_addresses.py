@@ -1,4 +1,4 @@
-"""Videos given by a URL."""
+"""Videos may be given by a URL."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class _Quiet(http.server.SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def server(clip: Path, tmp_path: Path) -> Iterator[str]:
-    """A web server with the clip, under a name with a space in it."""
+    """A web server with the clip, under a name that contains a space."""
     folder = tmp_path / "served"
     folder.mkdir()
     (folder / "a clip.mp4").write_bytes(clip.read_bytes())
@@ -41,14 +41,14 @@ def server(clip: Path, tmp_path: Path) -> Iterator[str]:
 
 @pytest.fixture
 def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder for temporary files, which must be empty at the end."""
+    """The folder for temporary files, which tests expect to be empty at the end."""
     folder = tmp_path / "scratch"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     return folder
 
 
-def test_a_url_is_as_good_as_its_file(
+def test_url_gives_the_same_result_as_the_file(
     server: str, clip: Path, tmp_path: Path, scratch: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra remote")
@@ -68,14 +68,14 @@ def test_a_url_is_as_good_as_its_file(
     assert os.listdir(scratch) == []
 
 
-def test_texts_name_the_url_not_the_copy(
+def test_messages_name_the_url_and_not_the_copy(
     server: str,
     tmp_path: Path,
     scratch: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The copy is gone when they are read."""
+    """The temporary copy no longer exists when a user reads them."""
     pytest.importorskip("aiohttp", reason="needs the extra remote")
     monkeypatch.chdir(tmp_path)
     url, report = f"{server}/a%20clip.mp4?sig=SECRET", tmp_path / "r.json"
@@ -92,23 +92,23 @@ def test_texts_name_the_url_not_the_copy(
         assert f"{server}/a%20clip.mp4" in texts[place]
 
 
-def test_urls_that_cannot_be_read(
+def test_unreadable_urls_are_reported(
     server: str, scratch: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra remote")
-    for address, said in (
+    for address, message in (
         (f"{server}/none.mp4", "no such file"),
         ("nothing://x/v.mp4", "fsspec"),
     ):
         assert main(["info", "--quiet", "--video", address]) == 2
         error = capsys.readouterr().err
         assert error.startswith(f"colmap-av1: error: {address}: ")
-        assert said in error
+        assert message in error
         assert error.count("\n") == 1
     assert os.listdir(scratch) == []
 
 
-def test_without_fsspec(
+def test_missing_fsspec_is_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "fsspec", None)
@@ -119,7 +119,7 @@ def test_without_fsspec(
     assert "pip install 'colmap-av1[remote]'" in error
 
 
-def test_python_takes_files() -> None:
+def test_python_functions_refuse_urls() -> None:
     for address in ("http://example.org/a b.mp4", "https://x:8/y?z#1"):
         with (
             pytest.raises(VideoError, match="URL"),

@@ -39,7 +39,7 @@ def test_short_commands_import_no_large_libraries(words: str, clip: Path, tmp_pa
     assert not loaded & {"pycolmap", "cv2", "scipy", "h5py", "rich"}
 
 
-def test_match_from_end_to_end(clip: Path, tmp_path: Path) -> None:
+def test_match_command(clip: Path, tmp_path: Path) -> None:
     words = ["match", "--database", "a.db", "--video", str(clip), "--image_path", "my frames"]
     run = subprocess.run(
         [*COMMAND, *words], cwd=tmp_path, capture_output=True, text=True, check=True
@@ -68,15 +68,13 @@ def test_match_from_end_to_end(clip: Path, tmp_path: Path) -> None:
     ]
 
 
-def test_refinement_is_an_option(
-    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_refine_option(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["match", "--database", str(tmp_path / "a.db"), "--video", str(clip), "--refine", "lk"]
     assert main(words) == 0
     assert float(read_table(capsys.readouterr().out)["seconds, refinement"]) > 0
 
 
-def test_spellings_of_options(clip: Path, tmp_path: Path) -> None:
+def test_options_have_several_spellings(clip: Path, tmp_path: Path) -> None:
     words = [
         *("match", f"--database_path={tmp_path / 'a.db'}", "--video-path", str(clip)),
         *("--ImageReader.camera_model", "PINHOLE", "--camera-params=200,200,96,64"),
@@ -90,7 +88,7 @@ def test_spellings_of_options(clip: Path, tmp_path: Path) -> None:
     assert cameras[1].params.tolist() == [200, 200, 96, 64]
 
 
-def test_minus_and_underscore_stay_in_values(clip: Path, tmp_path: Path) -> None:
+def test_dashes_and_underscores_in_values_are_kept(clip: Path, tmp_path: Path) -> None:
     assert main(["match", f"--database={tmp_path}/a-b_c.db", "--video", str(clip), "--quiet"]) == 0
     assert (tmp_path / "a-b_c.db").exists()
 
@@ -135,7 +133,7 @@ def bad_files(
 
 
 @pytest.mark.parametrize(("words", "message"), BAD, ids=lambda v: v if isinstance(v, str) else "")
-def test_bad_input_is_one_line_and_status_2(
+def test_invalid_input_gives_one_line_and_status_2(
     bad_files: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -158,7 +156,7 @@ def test_bad_input_is_one_line_and_status_2(
     assert sorted(bad_files.rglob("*")) == before
 
 
-def test_damage_is_told(
+def test_damage_is_reported(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = ffmpeg("-i", clip, "-c", "copy", "-movflags", "+faststart", tmp_path / "whole.mp4")
@@ -178,7 +176,7 @@ def test_damage_is_told(
     assert main(["info", "--video", str(cut), "--strict"]) == 2
 
 
-def test_info(clip: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_command(clip: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", "--video", str(clip)]) == 0
     table = read_table(capsys.readouterr().out)
     assert table["codec"] == "av1"
@@ -188,7 +186,7 @@ def test_info(clip: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("ending", ["npz", "h5"])
-def test_motion(
+def test_motion_command(
     clip: Path, tmp_path: Path, ending: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / f"m.{ending}"
@@ -197,7 +195,7 @@ def test_motion(
     assert list(tmp_path.iterdir()) == [output]
 
 
-def test_path_that_the_system_refuses(
+def test_path_refused_by_the_system_is_reported(
     clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     database = str(tmp_path / ("a" * 300))
@@ -207,7 +205,7 @@ def test_path_that_the_system_refuses(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
-def test_names_of_files_that_are_no_text_or_several_lines(clip: Path, tmp_path: Path) -> None:
+def test_file_names_may_be_invalid_text_or_several_lines(clip: Path, tmp_path: Path) -> None:
     name = os.fsdecode(b"\xff.mp4")
     (tmp_path / name).symlink_to(clip)
     strict = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
@@ -222,7 +220,7 @@ def test_names_of_files_that_are_no_text_or_several_lines(clip: Path, tmp_path: 
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
-def test_names_that_would_control_a_terminal(
+def test_control_characters_in_names_are_escaped(
     clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     odd = "\x1b]0;x\x07 \x1b[2J\rok\tb\nc\x9b\u2028\u202e\u3000.mp4"
@@ -251,7 +249,7 @@ def test_names_that_would_control_a_terminal(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
-def test_output_that_nobody_reads(clip: Path, tmp_path: Path) -> None:
+def test_closed_output_ends_the_command(clip: Path, tmp_path: Path) -> None:
     words = [sys.executable, "-m", "colmap_av1", "info", "--video", str(clip)]
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path
@@ -285,7 +283,7 @@ def test_interrupt_exits_with_130(tmp_path: Path) -> None:
     assert all(p.suffix == ".png" and p.name[0] != "." for p in tmp_path.glob("frames/*"))
 
 
-def test_terminal_sees_progress_and_a_table(clip: Path, tmp_path: Path) -> None:
+def test_terminal_shows_progress_and_a_table(clip: Path, tmp_path: Path) -> None:
     words = ["match", "--database", "a.db", "--video", str(clip), "--image_path", "frames"]
     ours, theirs = pty.openpty()
     process = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Options on the command line: refused before anything is opened, grouped, and found by name."""
+"""Options on the command line are checked before anything is opened, grouped and named."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ NEEDED = {
     "view": (*VIDEO, *OUTPUT),
 }
 
-# Option and value that the command refuses.
+# Command, option and invalid value.
 BAD = [
     ("match", "num_images", "1"),
     ("match", "image_name", "x.png"),
@@ -67,13 +67,13 @@ BAD = [
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder to work in."""
+    """An empty working folder."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 @pytest.mark.parametrize(("command", "name", "value"), BAD)
-def test_options_are_refused_before_anything_is_opened(
+def test_invalid_options_are_refused_before_anything_is_opened(
     command: str, name: str, value: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([command, *NEEDED[command], f"--{name}", value]) == 2
@@ -99,7 +99,7 @@ def test_options_are_refused_before_anything_is_opened(
         ("view --video", "--video"),
     ],
 )
-def test_unknown_options_are_named_with_the_nearest_one_and_the_command(
+def test_error_for_unknown_options_suggests_the_nearest_one(
     words: str, named: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="2"):
@@ -122,14 +122,14 @@ def options_in(text: str) -> set[str]:
 
 
 @pytest.mark.parametrize("command", ["encode", "info", "motion", "check", "export", "map"])
-def test_help_all_is_help_where_that_is_whole(
+def test_help_all_equals_help_of_commands_with_few_options(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert help_of(command, "--help-all", capsys) == help_of(command, "--help", capsys)
 
 
 @pytest.mark.parametrize("command", ["match", "reconstruct", "densify", "compare", "view"])
-def test_help_shows_few_options_and_help_all_the_rest(
+def test_help_shows_few_options_and_help_all_shows_all(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     short, full = help_of(command, "--help", capsys), help_of(command, "--help-all", capsys)
@@ -141,7 +141,7 @@ def test_help_shows_few_options_and_help_all_the_rest(
     assert options_in(help_of(command, "--help_all", capsys)) == every
 
 
-def test_help_of_other_commands_is_whole(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_of_other_commands_is_complete(capsys: pytest.CaptureFixture[str]) -> None:
     text = help_of("info", "--help", capsys)
     assert {"operating_point", "num_threads", "strict", "max_frame_size"} <= options_in(text)
     assert "help-all" not in text
@@ -154,7 +154,7 @@ def test_help_has_a_group_for_each_kind_of_options(capsys: pytest.CaptureFixture
     assert {"tracks", "two-view geometry", "poses", "points", "run"} <= set(titles)
     assert "selection of tracks" not in titles
     assert "Shown frames" not in text
-    assert "%" in text  # of frame_%06d.png, not taken for a format
+    assert "%" in text  # in frame_%06d.png, not interpreted as a format
 
 
 def parse(words: str, kind: type[Options]) -> Options:
@@ -163,7 +163,7 @@ def parse(words: str, kind: type[Options]) -> Options:
     return given(command.parse_args(words.split()), kind)
 
 
-def test_options_that_hold_others_are_built_from_words() -> None:
+def test_nested_options_are_built_from_arguments() -> None:
     words = "--min_length 6 --min_images 2 --num_threads 3 --random_seed 4 --strict --fps 2"
     options = parse(words, MatchOptions)
     assert isinstance(options, MatchOptions)
@@ -180,13 +180,13 @@ def test_options_that_hold_others_are_built_from_words() -> None:
     assert made.match.tracks.cell == 2
 
 
-def test_length_of_a_track_is_counted_in_frames_alone() -> None:
+def test_min_length_does_not_set_min_images() -> None:
     options = parse("--min_length 6", MatchOptions)
     assert isinstance(options, MatchOptions)
     assert options.density == DensityOptions()
 
 
-def test_spellings_of_colmap_and_of_before() -> None:
+def test_names_of_colmap_and_of_earlier_versions_are_accepted() -> None:
     words = (
         "--ImageReader.camera_model PINHOLE --ImageReader.single_camera 0 "
         "--TwoViewGeometry.max_error 3 --TwoViewGeometry.min_num_inliers 20 "
@@ -233,7 +233,7 @@ class _Everything(Options):
     names: tuple[str, ...] = option(("a", "b"), "what to 100%", common=True)
 
 
-def test_a_new_field_or_kind_needs_nothing_else() -> None:
+def test_options_are_derived_from_fields() -> None:
     assert parse("", _Everything) == _Everything()
     assert parse("--strength 3 --names c,d", _Everything) == _Everything(_Filter(3.0), ("c", "d"))
     command = Parser(prog="test")
@@ -257,7 +257,7 @@ def test_one_name_cannot_set_two_options() -> None:
 
 @pytest.mark.parametrize("command", ["match", "reconstruct", "densify"])
 @pytest.mark.parametrize("spelling", ["--photos", "--images"])
-def test_photos_have_two_spellings_of_which_help_shows_one(
+def test_photos_have_two_spellings_and_help_shows_one(
     command: str, spelling: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parser, _ = make_parser([command])

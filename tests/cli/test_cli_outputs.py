@@ -1,4 +1,4 @@
-"""No command writes over a file that exists, unless it is told to, and none over an input."""
+"""Commands overwrite existing files only with --overwrite, and never an input."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def made(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def work(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of it to work in."""
+    """A copy of the folder as the working folder."""
     shutil.copytree(made, tmp_path / "work")
     monkeypatch.chdir(tmp_path / "work")
     return tmp_path / "work"
@@ -64,7 +64,7 @@ INPUTS = [
 
 
 @pytest.mark.parametrize("words", INPUTS)
-def test_inputs_stay_even_with_overwrite(
+def test_inputs_are_kept_even_with_overwrite(
     words: str, work: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (work / "linked.mp4").symlink_to("v.mp4")
@@ -93,7 +93,9 @@ OTHERS = [
 
 
 @pytest.mark.parametrize("words", OTHERS)
-def test_files_of_others_stay(words: str, work: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_existing_files_are_kept_without_overwrite(
+    words: str, work: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (work / "pairs.txt").write_text("frame_000000.png frame_000001.png\n")
     before = contents(work)
     assert main(words.split()) == 2
@@ -105,7 +107,7 @@ def test_files_of_others_stay(words: str, work: Path, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("video", "report"), [("v.mp4", "v.mp4"), ("none.mp4", "notes.log"), ("v.mp4", "frames")]
 )
-def test_reports_replace_nothing_but_reports(
+def test_reports_only_replace_reports(
     video: str, report: str, work: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = contents(work)
@@ -132,7 +134,7 @@ AGAIN = [
 
 
 @pytest.mark.parametrize(("words", "output"), AGAIN)
-def test_output_is_replaced_on_demand_alone(
+def test_output_is_only_replaced_with_overwrite(
     words: str, output: str, work: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*words.split(), "--quiet"]) == 0
@@ -147,7 +149,7 @@ def test_output_is_replaced_on_demand_alone(
     assert contents(work) == first
 
 
-def test_models_are_replaced_on_demand_alone(
+def test_models_are_only_replaced_with_overwrite(
     work: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["map", "--database", "a.db", "--image_path", "frames", "--output", "model"]
@@ -159,7 +161,7 @@ def test_models_are_replaced_on_demand_alone(
     assert "notes.txt" in capsys.readouterr().err
     (work / "model" / "notes.txt").unlink()
     assert contents(work) == before
-    # Where the mapper fails, for which no pair has inliers enough to start, what was there stays.
+    # If the mapper fails, here because no pair has enough inliers, the old model is kept.
     with closing(sqlite3.connect("a.db")) as database, database:
         database.execute(
             "UPDATE two_view_geometries SET rows = 20, data = substr(data, 1, 20 * cols * 4)"
@@ -173,7 +175,7 @@ def test_models_are_replaced_on_demand_alone(
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
 @pytest.mark.parametrize("steps", range(0, 9, 2))
-def test_models_half_replaced_survive_a_run_that_fails(steps: int, work: Path) -> None:
+def test_half_replaced_model_is_restored_by_a_failing_run(steps: int, work: Path) -> None:
     before = contents(work / "model")
     kill_while_replacing(work / "model", steps)
     words = "densify --model frames --video none.mp4 --output model --overwrite --quiet"

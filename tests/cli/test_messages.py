@@ -1,4 +1,4 @@
-"""Messages name the cause: pipes, addresses, permissions, marks of byte order, leading signs."""
+"""Messages name the cause of an error in one line."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ posix = pytest.mark.skipif(os.name != "posix", reason="there are no such files o
 
 
 def error_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line that a command which refuses its input says."""
+    """The one-line error message of a command that refuses its input."""
     try:
         status: object = main(words)
-    except SystemExit as end:  # argparse's way out
+    except SystemExit as end:  # raised by argparse
         status = end.code
     out, err = capsys.readouterr()
     assert (status, out, err.count("\n")) == (2, "", 1)
@@ -38,7 +38,7 @@ def error_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 @posix
-def test_pipes(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pipes_are_refused(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pipe, database = str(tmp_path / "pipe"), str(tmp_path / "a.db")
     os.mkfifo(pipe)
     for command in (["info"], ["match", "--database", database], ["encode", "--output", "x.mp4"]):
@@ -50,7 +50,7 @@ def test_pipes(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_lists_with_a_mark_of_byte_order(clip: Path, tmp_path: Path, encoding: str) -> None:
+def test_lists_may_have_a_byte_order_mark(clip: Path, tmp_path: Path, encoding: str) -> None:
     (tmp_path / "list.txt").write_text("0 é0.png\n5 é5.png\n9 é9.png\n", encoding=encoding)
     words = ["match", "--database", str(tmp_path / "a.db"), "--video", str(clip), "--quiet"]
     assert main([*words, "--frame_list", str(tmp_path / "list.txt")]) == 0
@@ -59,7 +59,7 @@ def test_lists_with_a_mark_of_byte_order(clip: Path, tmp_path: Path, encoding: s
 
 
 @pytest.mark.parametrize(
-    ("words", "way_out"),
+    ("words", "remedy"),
     [
         (["--cosine", "-1e-3"], "--cosine=-1e-3"),
         (["--camera-params", "-1,2,3"], "--camera_params=-1,2,3"),
@@ -67,11 +67,11 @@ def test_lists_with_a_mark_of_byte_order(clip: Path, tmp_path: Path, encoding: s
         (["--database", "-a.db"], "--database=-a.db"),
     ],
 )
-def test_values_that_begin_like_options(
-    words: list[str], way_out: str, capsys: pytest.CaptureFixture[str]
+def test_values_that_look_like_options_are_explained(
+    words: list[str], remedy: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     error = error_of(["match", "--video", "none.mp4", "--database", "a.db", *words], capsys)
-    assert way_out in error
+    assert remedy in error
 
 
 @pytest.mark.parametrize(
@@ -85,33 +85,33 @@ def test_values_that_begin_like_options(
         ["view", "--model", "", "--output", "out.html"],
     ],
 )
-def test_paths_that_are_empty(
+def test_empty_paths_are_refused(
     words: list[str],
     tmp_path: Path,
     clip: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """As of variables of a shell that are not set."""
+    """Unset shell variables cause empty paths."""
     monkeypatch.chdir(tmp_path)
     shutil.copyfile(clip, "v.mp4")
     assert "empty" in error_of(words, capsys)
     assert os.listdir() == ["v.mp4"]
 
 
-def test_values_below_zero_are_values(capsys: pytest.CaptureFixture[str]) -> None:
+def test_negative_numbers_are_accepted_as_values(capsys: pytest.CaptureFixture[str]) -> None:
     for words in (["--cosine", "-0.5"], ["--cosine=-1e-3"], ["--cosine", "-1"]):
         error = error_of(["match", "--video", "none.mp4", "--database", "a.db", *words], capsys)
         assert "none.mp4" in error
 
 
-def test_operating_points_that_no_stream_has(capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_operating_points_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     for command in (["info"], ["match", "--database", "a.db"], ["reconstruct", "--output", "out"]):
         error = error_of([*command, "--video", "none.mp4", "--operating_point", "99"], capsys)
         assert "operating_point" in error
 
 
-def test_operating_points_that_this_stream_has_not(
+def test_operating_points_missing_in_the_stream_are_refused(
     clip: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for video, point in ((clip, 1), (LAYERS, 2)):
@@ -119,10 +119,10 @@ def test_operating_points_that_this_stream_has_not(
         assert f"operating_point {point}" in error
 
 
-def test_colours_that_there_are_none_of(
+def test_unknown_colour_space_does_not_prevent_matching(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Motion is read all the same; a matrix that is reserved says nothing of colours."""
+    """With reserved matrix coefficients, motion is read but pictures cannot be converted."""
     reserved = ffmpeg(
         *("-i", clip, "-c", "copy", "-bsf:v", "av1_metadata=matrix_coefficients=3"),
         tmp_path / "v.mp4",
@@ -134,7 +134,9 @@ def test_colours_that_there_are_none_of(
     assert sorted(os.listdir(tmp_path)) == ["a.db", "v.mp4"]
 
 
-def test_one_frame(encode: Encode, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_a_single_frame(
+    encode: Encode, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     video = encode(make_frames(1), tmp_path / "one.mp4")
     assert main(["info", "--video", str(video)]) == 0
     table = dict(line.split("\t") for line in capsys.readouterr().out.splitlines())
@@ -145,7 +147,7 @@ def test_one_frame(encode: Encode, tmp_path: Path, capsys: pytest.CaptureFixture
 
 @pytest.fixture
 def others(clip: Path) -> Iterator[Path]:
-    """A folder of files that this process, without root's rights, must not read."""
+    """A folder of files that this process may not read without root permissions."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         shutil.copyfile(clip, folder / "v.mp4")
@@ -177,7 +179,7 @@ READERS: list[tuple[str, Callable[[Path], object]]] = [
 
 @posix
 @pytest.mark.parametrize(("name", "read"), READERS)
-def test_files_that_must_not_be_read(
+def test_unreadable_files_are_reported(
     name: str, read: Callable[[Path], object], others: Path
 ) -> None:
     with pytest.raises(ColmapAv1Error, match=f"{name}: .*permission"):

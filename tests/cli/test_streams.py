@@ -1,4 +1,4 @@
-"""Standard streams that are closed, full or not read: one line or none, and status 2 or 141."""
+"""With closed, full or unread standard streams, commands print at most one line and fail."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from colmap_av1.motion.motion_file import export_motion
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other shells and devices there")
 
-# Exit status and number of lines of errors.
+# Exit status and number of error lines.
 CASES = {
     "--version >&-": (2, 1),
     "--version >/dev/full": (2, 1),
@@ -26,8 +26,8 @@ CASES = {
 }
 
 
-def test_broken_streams(clip: Path, tmp_path: Path) -> None:
-    """All at once: each takes longer to start than to run."""
+def test_broken_streams_give_at_most_one_line(clip: Path, tmp_path: Path) -> None:
+    """The commands run in parallel, because starting takes most of the time."""
     shutil.copyfile(clip, tmp_path / "v.mp4")
     program = shlex.join([sys.executable, "-m", "colmap_av1"])
     started = {}
@@ -42,10 +42,10 @@ def test_broken_streams(clip: Path, tmp_path: Path) -> None:
         )
     found = {}
     for case, process in started.items():
-        _, said = process.communicate(timeout=120)
-        assert "Traceback" not in said
-        found[case] = (process.returncode, said.count("\n"))
+        _, error = process.communicate(timeout=120)
+        assert "Traceback" not in error
+        found[case] = (process.returncode, error.count("\n"))
     assert found == CASES
-    # What a library printed would have ended in a file that got a closed stream's number.
+    # Output of a library could end up in a file that got the number of a closed stream.
     export_motion(clip, tmp_path / "again.npz")
     assert (tmp_path / "m.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
