@@ -39,7 +39,7 @@ def found(report: DatabaseCheck) -> list[tuple[str, str]]:
 
 
 def maps(path: Path) -> bool:
-    """Whether pycolmap's mapper makes a model with all images of the database."""
+    """Whether pycolmap's mapper reconstructs all images of the database."""
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
     try:
@@ -49,7 +49,7 @@ def maps(path: Path) -> bool:
     return any(model.num_reg_images() == NUM_IMAGES for model in models.values())
 
 
-def test_new_database(tmp_path: Path) -> None:
+def test_report_of_a_new_database(tmp_path: Path) -> None:
     path = tmp_path / "new.db"
     write_matches(path, NAMES, CAMERA, **OURS)
     report = check_database(path)
@@ -66,7 +66,7 @@ def test_new_database(tmp_path: Path) -> None:
     assert report.num_inliers == sum(len(g.inlier_matches) for g in OURS["geometries"])
     assert report.configs == {"CALIBRATED": len(OURS["pairs"])}
     assert report.parallax is not None
-    # The camera moves 40 degrees around the scene, which only the widest pair sees.
+    # The camera moves 40 degrees around the scene, which only the first and last image span.
     assert 25 < report.parallax.angle < 40
     assert report.parallax.focal_known
     assert set(report.parallax.names) == {NAMES[0], NAMES[-1]}
@@ -75,7 +75,7 @@ def test_new_database(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_database_of_sift(tmp_path: Path, layout: str) -> None:
+def test_report_of_a_sift_database(tmp_path: Path, layout: str) -> None:
     path = tmp_path / "sift.db"
     make_existing(path, layout, "sift")
     report = check_database(path)
@@ -94,7 +94,7 @@ def test_database_of_sift(tmp_path: Path, layout: str) -> None:
     assert any("order of names" in text for _, text in found(report))
 
 
-def test_migrated_database(tmp_path: Path) -> None:
+def test_migrated_database_is_recognised(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
     make_existing(path, "3.8", "sift")
     pycolmap.Database.open(path).close()
@@ -103,7 +103,7 @@ def test_migrated_database(tmp_path: Path) -> None:
     assert report.readers == "3.8, 3.9 and 4.x"
 
 
-# What is done to a database, what is found, and whether pycolmap still maps all its images.
+# SQL changes to a database, the finding, and whether pycolmap still maps all its images.
 CHANGES = {
     "no camera": (
         ["UPDATE images SET camera_id = 7 WHERE image_id = 8"],
@@ -258,7 +258,7 @@ CHANGES = {
 @pytest.mark.parametrize(
     ("changes", "severity", "word", "mapped"), CHANGES.values(), ids=CHANGES.keys()
 )
-def test_findings(
+def test_changed_database_gives_the_finding(
     tmp_path: Path, changes: list[str], severity: str, word: str, mapped: bool | None
 ) -> None:
     path = tmp_path / "given.db"
@@ -284,7 +284,7 @@ def test_findings(
         (12.0, "note"),
     ],
 )
-def test_little_parallax(tmp_path: Path, arc: float, severity: str) -> None:
+def test_little_parallax_is_reported(tmp_path: Path, arc: float, severity: str) -> None:
     scene = make_scene(num_frames=NUM_IMAGES, num_points=500, noise=0.05, arc_degrees=arc)
     write_matches(tmp_path / "a.db", NAMES, CAMERA, **match_scene(scene, CAMERA))
     report = check_database(tmp_path / "a.db")
@@ -293,8 +293,8 @@ def test_little_parallax(tmp_path: Path, arc: float, severity: str) -> None:
     assert report.parallax.angle == pytest.approx(0.75 * arc, rel=0.3)
 
 
-def test_configuration_of_a_rig(tmp_path: Path) -> None:
-    """Pairs of a calibrated rig have a pose of their essential matrix, as calibrated ones."""
+def test_pairs_of_a_calibrated_rig_are_used(tmp_path: Path) -> None:
+    """Their pose comes from the essential matrix, as for calibrated pairs."""
     path = tmp_path / "a.db"
     write_matches(path, NAMES, CAMERA, **OURS)
     before = check_database(path)
@@ -306,7 +306,7 @@ def test_configuration_of_a_rig(tmp_path: Path) -> None:
     assert report.parallax.angle == pytest.approx(before.parallax.angle)
 
 
-def test_guessed_focal_length_is_told(tmp_path: Path) -> None:
+def test_assumed_focal_length_is_reported(tmp_path: Path) -> None:
     guess = make_camera(CameraOptions(), WIDTH, HEIGHT)
     scene = make_scene(num_frames=NUM_IMAGES, num_points=500)
     write_matches(tmp_path / "a.db", NAMES, guess, **match_scene(scene, guess))
@@ -317,8 +317,8 @@ def test_guessed_focal_length_is_told(tmp_path: Path) -> None:
     assert report.parallax.angle == pytest.approx(30, rel=0.35)
 
 
-def test_forward_motion(tmp_path: Path) -> None:
-    """Keypoints that move away from the centre, as those of a driving car do."""
+def test_forward_motion_is_reported(tmp_path: Path) -> None:
+    """The keypoints move away from the centre, as in a driving car."""
     rng = np.random.default_rng(0)
     points = rng.uniform([-8, -6, 8], [8, 6, 30], (4000, 3))
     xy = []
@@ -348,7 +348,7 @@ def listing(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("journal", ["delete", "wal"])
 @pytest.mark.parametrize("layout", ["3.8", "4.2"])
-def test_nothing_is_altered(tmp_path: Path, layout: str, journal: str) -> None:
+def test_database_is_not_modified(tmp_path: Path, layout: str, journal: str) -> None:
     path = tmp_path / "given.db"
     make_existing(path, layout, "sift")
     query(path, f"PRAGMA journal_mode = {journal}")
@@ -361,7 +361,7 @@ def test_nothing_is_altered(tmp_path: Path, layout: str, journal: str) -> None:
     assert path.stat().st_mtime_ns == time
 
 
-def test_log_of_another_process_is_read(tmp_path: Path) -> None:
+def test_write_ahead_log_of_another_process_is_read(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
     make_existing(path, "4.2", "listed")
     writer = sqlite3.connect(path)
@@ -375,7 +375,7 @@ def test_log_of_another_process_is_read(tmp_path: Path) -> None:
     writer.close()
 
 
-def test_interrupted_write_is_told(tmp_path: Path) -> None:
+def test_interrupted_write_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
     make_existing(path, "3.8", "sift")
     query(path, "PRAGMA journal_mode = delete")
@@ -394,7 +394,7 @@ def test_interrupted_write_is_told(tmp_path: Path) -> None:
     assert listing(tmp_path) == before
 
 
-def test_what_cannot_be_read(tmp_path: Path) -> None:
+def test_unreadable_databases_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.db").touch()
     (tmp_path / "text.db").write_text("no database, but long enough to be one\n" * 99)
     make_layout(tmp_path / "damaged.db", "3.8")
@@ -415,14 +415,14 @@ def test_what_cannot_be_read(tmp_path: Path) -> None:
     assert not (tmp_path / "absent.db").exists()
 
 
-def test_empty_database_lists_nothing(tmp_path: Path) -> None:
+def test_empty_database_is_reported(tmp_path: Path) -> None:
     make_layout(tmp_path / "a.db", "4.2")
     ((severity, text),) = found(check_database(tmp_path / "a.db"))
     assert severity == "error"
     assert "images" in text
 
 
-def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.db"
     make_existing(path, "4.2", "sift")
     assert main(["check", "--database", str(path), "--strict"]) == 0
@@ -437,8 +437,8 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_large_ids(tmp_path: Path) -> None:
-    """Ids near the limit of COLMAP's pair ids."""
+def test_large_image_ids_are_read(tmp_path: Path) -> None:
+    """The ids are near the limit of COLMAP's pair ids."""
     path = tmp_path / "a.db"
     write_matches(path, NAMES[:2], CAMERA, **two_images())
     big = 2147483646

@@ -26,6 +26,6 @@ def rows(shortest: float, longest: float) -> dict[str, str]:
     return dict(model_rows(ModelCheck(figures, Seams((), NONE, NONE, NONE, NONE), None, None)))
 
 
-def test_focal_lengths_of_several_cameras() -> None:
+def test_focal_lengths_are_printed_as_a_range() -> None:
     assert rows(319.2, 475.1)["focal lengths"] == "319.20 to 475.10 px"
     assert rows(319.2, 319.2)["focal length"] == "319.20 px"

@@ -29,7 +29,7 @@ def read_folder(folder: Path) -> HlocMatches:
 
 
 def check_holds(found: HlocMatches, rows: dict[str, Any], kind: str) -> None:
-    """What was read is what was written, whatever the order of images and of matches."""
+    """Check that the rows were read, in any order of images and matches."""
     assert found.names == NAMES
     assert (found.sizes == [WIDTH, HEIGHT]).all()
     for keypoints, expected in zip(found.keypoints, rows["keypoints"], strict=True):
@@ -47,7 +47,7 @@ def check_holds(found: HlocMatches, rows: dict[str, Any], kind: str) -> None:
 
 @pytest.mark.parametrize("verified", [True, False])
 @pytest.mark.parametrize("layout", ["3.8", "4.2"])
-def test_round_trip(tmp_path: Path, layout: str, verified: bool) -> None:
+def test_export_and_import_are_inverse(tmp_path: Path, layout: str, verified: bool) -> None:
     path = tmp_path / "sift.db"
     make_existing(path, layout, "sift")
     before = path.read_bytes()
@@ -67,8 +67,8 @@ def test_round_trip(tmp_path: Path, layout: str, verified: bool) -> None:
     check_holds(found, THEIRS, "geometries" if verified else "matches")
 
 
-def test_layout_is_that_of_hloc(tmp_path: Path) -> None:
-    """Names, shapes and types as extract_features and match_features write them."""
+def test_layout_matches_hloc(tmp_path: Path) -> None:
+    """Names, shapes and types are those of extract_features and match_features."""
     path = tmp_path / "a.db"
     names = ["left/1.png", "left/2.png", "right/1.png"]
     xy = np.array([[0.5, 0.5], [10.25, 3.5], [99.0, 7.75]], np.float32)
@@ -103,7 +103,7 @@ def test_layout_is_that_of_hloc(tmp_path: Path) -> None:
     assert found.matches[0].tolist() == [[0, 1], [2, 0]]
 
 
-def test_positions_survive_near_the_edge(tmp_path: Path) -> None:
+def test_positions_near_the_edge_are_exact(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     xy = np.concatenate([rng.uniform(0, 1, (500, 2)), rng.uniform(0, 4000, (500, 2))])
     keypoints = ImageKeypoints(0, xy.astype(np.float32), np.arange(1000))
@@ -116,14 +116,14 @@ def test_positions_survive_near_the_edge(tmp_path: Path) -> None:
     found = read_folder(tmp_path)
     assert np.array_equal(found.keypoints[0], keypoints.xy)
     assert found.keypoints[1].shape == (0, 2)
-    # hloc adds the half pixel in the file's own type, and COLMAP stores float32.
+    # hloc adds half a pixel in the type of the file, and COLMAP stores float32.
     with h5py.File(tmp_path / "features.h5") as file:
         stored = file[f"{NAMES[0]}/keypoints"][()]
         stored += 0.5
         assert np.array_equal(stored.astype(np.float32), keypoints.xy)
 
 
-def test_many_keypoints_need_wider_numbers(tmp_path: Path) -> None:
+def test_many_keypoints_need_wider_integers(tmp_path: Path) -> None:
     xy = np.zeros((40000, 2), np.float32)
     keypoints = [ImageKeypoints(i, xy, np.arange(40000)) for i in range(2)]
     matches = np.array([[3, 39999]], np.uint32)
@@ -149,7 +149,7 @@ def test_same_database_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_hloc_reconstructs_from_the_files(tmp_path: Path) -> None:
-    """hloc's own program, where it is installed."""
+    """Runs hloc itself if it is installed."""
     pytest.importorskip("hloc.reconstruction", reason="hloc is not installed")
     database, images = tmp_path / "a.db", tmp_path / "images"
     write_matches(database, NAMES, CAMERA, **OURS)
@@ -190,7 +190,7 @@ HALF = np.array([[0, 0], [10, 20.5], [7, 1]], np.float16)
 
 @pytest.mark.parametrize("separator", ["/", "_"])
 def test_files_of_hloc_are_read(tmp_path: Path, separator: str) -> None:
-    """Half precision, no scores, no sizes; in files of the first versions '_' parts a pair."""
+    """Half precision, no scores, no sizes; the first versions separate a pair by '_'."""
     names = ["cam_a/1_1.png", "cam_b/1_1.png"]
     pairs = {separator.join(n.replace("/", "-") for n in reversed(names)): [2, -1, 0]}
     found = read_folder(write_hloc(tmp_path, pairs, dict.fromkeys(names, HALF)))
@@ -223,7 +223,7 @@ def test_pair_in_both_directions_is_read_once(tmp_path: Path) -> None:
         ({"a/b": [0, 1, 2]}, {"a": HALF[:, 0], "b": HALF}, "float16"),
     ],
 )
-def test_files_that_do_not_fit(
+def test_inconsistent_files_are_refused(
     tmp_path: Path, pairs: dict[str, Any], keypoints: dict[str, Any], message: str
 ) -> None:
     write_hloc(tmp_path, pairs, keypoints)
@@ -232,7 +232,7 @@ def test_files_that_do_not_fit(
     assert "\n" not in str(caught.value)
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     write_hloc(tmp_path, {"a/b": [0, 1, 2]}, {"a": HALF, "b": HALF})
     with pytest.raises(HlocError, match="no such file"):
         read_hloc(tmp_path / "none.h5", tmp_path / "matches.h5")
@@ -259,7 +259,9 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_hloc_has_no_place_for(tmp_path: Path, sql: str, message: str) -> None:
+def test_databases_that_hloc_cannot_represent_are_refused(
+    tmp_path: Path, sql: str, message: str
+) -> None:
     path = tmp_path / "a.db"
     make_existing(path, "3.11", "sift")
     alter(path, sql)
@@ -281,7 +283,7 @@ def test_failures_leave_nothing(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.db", "file"]
 
 
-def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_matches(tmp_path / "a.db", NAMES, CAMERA, **OURS)
     words = ["export", "--database", str(tmp_path / "a.db"), "--output", str(tmp_path / "h")]
     assert main([*words, "--format", "hloc", "--verified", "0"]) == 0

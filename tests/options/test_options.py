@@ -1,4 +1,4 @@
-"""Options refuse what cannot work when they are made, by what their fields declare."""
+"""Options check their values on construction, as declared by their fields."""
 
 from __future__ import annotations
 
@@ -197,8 +197,8 @@ WRONG_TYPES: list[tuple[type, dict[str, Any]]] = [
     REFUSED + WRONG_TYPES,
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
-def test_values_that_cannot_work_are_refused_when_made(kind: type, given: dict[str, Any]) -> None:
-    """With an error of one line that names the option."""
+def test_invalid_values_are_refused_on_construction(kind: type, given: dict[str, Any]) -> None:
+    """The error is one line and names the option."""
     name = "|".join(given).replace("_", "[ _]")
     with pytest.raises(OptionError, match=name) as caught:
         kind(**given)
@@ -207,7 +207,7 @@ def test_values_that_cannot_work_are_refused_when_made(kind: type, given: dict[s
         replace(kind(), **given)
 
 
-def test_what_trainers_cannot_use_is_refused() -> None:
+def test_image_names_that_trainers_cannot_use_are_refused() -> None:
     match = MatchOptions(images=ImageOptions(image_name="a.b_%d.png"))
     with pytest.raises(OptionError, match="image_name"):
         ReconstructOptions(match=match)
@@ -236,18 +236,18 @@ def test_every_kind_is_exported() -> None:
     assert sorted(colmap_av1.__all__) == colmap_av1.__all__
 
 
-def test_numbers_of_numpy_and_paths_are_taken() -> None:
+def test_numpy_numbers_and_paths_are_accepted() -> None:
     assert PairOptions(offsets=(np.int64(3),)).offsets == (3,)
     assert TrackOptions(cosine=np.float32(0.5), border=3).border == 3
     assert ImageOptions(frame_list=Path("a.txt")).frame_list == Path("a.txt")
 
 
-def test_parameters_without_a_model_may_be_those_of_oblong_pixels() -> None:
+def test_camera_params_without_a_model_may_have_any_valid_length() -> None:
     assert CameraOptions(camera_params="500,320,240,0").camera_model is None
     assert CameraOptions(camera_params="500,400,320,240,0,0,0,0").camera_model is None
 
 
-def test_threads_of_the_run_read_the_bitstream() -> None:
+def test_num_threads_of_the_run_applies_to_reading() -> None:
     run = RunOptions(num_threads=3)
     assert MatchOptions(run=run).reading == ReadOptions(num_threads=3)
     own = ReadOptions(num_threads=2, strict=True)
@@ -267,14 +267,14 @@ def test_a_field_declares_its_own_bounds() -> None:
             _More(**given)
 
 
-def test_choices_are_those_of_what_they_choose() -> None:
+def test_choices_match_the_implementations() -> None:
     encoders = typing.get_args(field_types(EncodeOptions)["encoder"])
     assert encoders == ("auto", *ENCODERS)
     assert typing.get_args(field_types(DensityOptions)["preset"]) == tuple(PRESETS)
     assert set(IMAGE_EXTENSIONS) == set(WRITE_PARAMETERS)
 
 
-def test_parts_that_are_unused_exist() -> None:
+def test_declared_unused_options_exist() -> None:
     for kind in (DensifyOptions, ReconstructOptions, CompareOptions, MatchOptions):
         for field in dataclasses.fields(kind):
             for path in declared_of(field).unused:
@@ -291,7 +291,7 @@ def test_parts_that_are_unused_exist() -> None:
         ("shot%d.png", None, "shot%d.png"),
     ],
 )
-def test_formats_of_images_of_reconstruct(
+def test_image_type_sets_the_extension(
     name: str, image_type: Literal["png"] | None, expected: str
 ) -> None:
     images = ImageOptions(image_name=name)
