@@ -26,7 +26,7 @@ def test_distances_of_known_clouds() -> None:
     assert distances.extent == pytest.approx(0.9 * 3)
 
 
-def test_one_stray_point_moves_the_hausdorff_distance_alone() -> None:
+def test_stray_point_only_changes_the_hausdorff_distance() -> None:
     cloud = np.random.default_rng(0).random((2000, 3))
     stray = np.concatenate([cloud, [[50.0, 0, 0]]])
     distances = cloud_distances(stray, cloud)
@@ -36,18 +36,18 @@ def test_one_stray_point_moves_the_hausdorff_distance_alone() -> None:
     assert distances.completeness == 0
 
 
-def test_depths_are_compared_with_points_beside() -> None:
+def test_depths_are_compared_with_neighbouring_points() -> None:
     options = pycolmap.SyntheticDatasetOptions(num_frames_per_rig=6, num_points3D=400)
     pycolmap.set_random_seed(0)
     truth = pycolmap.synthesize_dataset(options)
     assert np.nanmax(depth_differences(truth, truth)) < 1e-9
-    # Away from the cameras' image centres by 3 % of the depth in the middle image of each track.
+    # Each point is moved away from the camera in the middle of its track by 3 % of its depth.
     moved = copy.deepcopy(truth)
     for point in moved.points3D.values():
         ids = sorted(e.image_id for e in point.track.elements)
         centre = moved.images[ids[len(ids) // 2]].projection_center()
         point.xyz = centre + 1.03 * (point.xyz - centre)
-    # Points beside are others now and then.
+    # The nearest neighbour of a point in the image is sometimes a different point.
     assert np.nanmedian(depth_differences(moved, truth, pixels=0.5)) == pytest.approx(0.03)
     far = copy.deepcopy(truth)
     for point in far.points3D.values():

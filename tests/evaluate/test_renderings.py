@@ -24,14 +24,14 @@ def photograph() -> np.ndarray:
     return cv2.GaussianBlur(image, (0, 0), 0.8)
 
 
-def test_known_values(tmp_path: Path) -> None:
+def test_metrics_have_known_values(tmp_path: Path) -> None:
     # Greys 100 and 120 have the luma 16 + 219 / 255 * grey = 102 and 119.
     grey = [np.full((180, 240, 3), value, dtype=np.uint8) for value in (100, 120)]
     files = [write(tmp_path / f"{i}.png", image) for i, image in enumerate(grey)]
     metrics = rendering_metrics([files[0], files[0]], [files[1], files[0]])
     assert metrics.psnr_y[0] == pytest.approx(20 * math.log10(255 / 17), abs=1e-3)
     assert metrics.psnr_y[1] == 60
-    # Without structure SSIM is that of the means: (2ab + c) / (a^2 + b^2 + c).
+    # For constant images, SSIM only depends on the means: (2ab + c) / (a^2 + b^2 + c).
     ssim = (2 * 102 * 119 + 6.5025) / (102**2 + 119**2 + 6.5025)
     assert metrics.ssim_db[0] == pytest.approx(-10 * math.log10(1 - ssim), abs=1e-2)
     assert metrics.sharpness.tolist() == [0, 0]
@@ -60,7 +60,7 @@ def test_sharpness_of_a_ramp_and_of_noise(tmp_path: Path) -> None:
     assert metrics.sharpness[1] < 1
 
 
-def test_images_of_several_sizes_and_odd_ones(photograph: np.ndarray, tmp_path: Path) -> None:
+def test_images_may_have_several_and_odd_sizes(photograph: np.ndarray, tmp_path: Path) -> None:
     small = write(tmp_path / "small.png", photograph[:121, :199])
     large = write(tmp_path / "large.png", photograph)
     other = write(tmp_path / "other.png", 255 - photograph)
@@ -69,7 +69,7 @@ def test_images_of_several_sizes_and_odd_ones(photograph: np.ndarray, tmp_path: 
     assert metrics.psnr_y[1] < 20
 
 
-def test_what_does_not_fit_is_refused(photograph: np.ndarray, tmp_path: Path) -> None:
+def test_mismatched_or_missing_images_are_refused(photograph: np.ndarray, tmp_path: Path) -> None:
     large = write(tmp_path / "large.png", photograph)
     small = write(tmp_path / "small.png", photograph[:100])
     with pytest.raises(ImageError, match="size"):

@@ -24,14 +24,14 @@ from colmap_av1.evaluate.training.splatting import (
 from colmap_av1.evaluate.training.trainers import Training, train, write_split
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, write_model
 
-# A Python with torch, gsplat and pytorch-msssim; they are too large for every machine.
+# A Python with torch, gsplat and pytorch-msssim, which are too large to be always installed.
 TORCH_PYTHON = os.environ.get("COLMAP_AV1_TORCH_PYTHON")
 SIZE = 32, 24
 FOCAL = 24.0
 
 
 def texture(xyz: np.ndarray) -> np.ndarray:
-    """Colour [n, 3], 0 to 1, of places on the plane z = 4."""
+    """Colours [n, 3], 0 to 1, of points on the plane z = 4."""
     x, y = xyz[..., 0], xyz[..., 1]
     waves = [np.sin(2 * x + y), np.cos(1.5 * x - 2 * y), np.sin(x) * np.cos(y)]
     return 0.5 + 0.4 * np.stack(waves, -1)
@@ -46,7 +46,7 @@ def photograph(centre: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Folders of the model of a plane before eight cameras, and of its images."""
+    """Folders of a model with eight cameras in front of a plane, and of its images."""
     folder = tmp_path_factory.mktemp("scene")
     model, image_path = folder / "model", folder / "images"
     model.mkdir()
@@ -88,14 +88,14 @@ def test_images_are_split_evenly() -> None:
     assert split_images(["c", "a", "b"]) == (["a", "c"], ["b"])
 
 
-def test_share_of_time() -> None:
+def test_share_of_time_to_the_same_quality() -> None:
     baseline = [milestone(1, 10, 20), milestone(2, 40, 25)]
     assert share_of_time(baseline, baseline) == 1
     quick = [milestone(1, 10, 24), milestone(2, 20, 26), milestone(3, 30, 27)]
     assert share_of_time(quick, baseline) == 15 / 40
     assert share_of_time([milestone(1, 8, 25)], baseline) == 0.2
     assert share_of_time([milestone(1, 8, 24.9)], baseline) is None
-    # VMAF has the same figures here, and is its own question.
+    # VMAF has the same values here.
     assert share_of_time(quick, baseline, "vmaf") == 15 / 40
     assert share_of_time([milestone(1, math.nan, 26)], baseline) is None
     assert share_of_time(quick, [milestone(1, math.nan, 25)]) is None
@@ -110,7 +110,7 @@ def test_quality_after_seconds() -> None:
     assert quality_after([], 10) is None
 
 
-def test_scene_is_the_model(scene: tuple[Path, Path], tmp_path: Path) -> None:
+def test_written_scene_matches_the_model(scene: tuple[Path, Path], tmp_path: Path) -> None:
     write_scene(*scene, tmp_path / "scene.npz")
     arrays = np.load(tmp_path / "scene.npz")
     assert arrays["files"].tolist() == [str(scene[1] / f"frame_{i:06d}.png") for i in range(8)]
@@ -122,7 +122,7 @@ def test_scene_is_the_model(scene: tuple[Path, Path], tmp_path: Path) -> None:
     np.testing.assert_allclose(arrays["colors"], texture(arrays["points"]), atol=1 / 255)
 
 
-def test_distortion_is_refused(scene: tuple[Path, Path], tmp_path: Path) -> None:
+def test_distorted_cameras_are_refused(scene: tuple[Path, Path], tmp_path: Path) -> None:
     model = pycolmap.Reconstruction(scene[0])
     camera = model.cameras[1]
     camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, [24, 16, 12, 0.1]
@@ -154,7 +154,7 @@ def test_missing_packages_and_gpu_are_reported(
 def test_training_on_cpu(
     scene: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All of the training but gsplat's rasterizer, which runs on GPUs only."""
+    """Tests everything except gsplat's rasterizer, which needs a GPU."""
     script = tmp_path / "program.py"
     aid = PROJECT / "tests" / "support" / "splatting_on_cpu.py"
     script.write_text(
@@ -168,6 +168,6 @@ def test_training_on_cpu(
     assert (first.iteration, last.iteration) == (1, 1400)
     assert first.num_gaussians == 80 < last.num_gaussians
     assert 0 < first.seconds < last.seconds == training.seconds
-    # The images tested on were not trained on.
+    # The test images are not used for training.
     assert last.metrics.psnr_y.mean() > first.metrics.psnr_y.mean() + 6
     assert len(last.metrics.psnr_y) == len(training.renders) == 4

@@ -1,4 +1,4 @@
-"""Commands that train: no shell reads them, and what fails says where its log is."""
+"""Training commands run without a shell, and errors name their log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from colmap_av1.evaluate.training.trainers import Split, check_trainer, train
 ANSWER = "import sys; print(sys.argv[1:]); sys.exit(3)"
 
 
-def test_names_of_folders_are_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_names_are_not_interpreted_by_a_shell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "a b $(touch c) `touch d` '\"; touch e; {f}"
     split = Split(folder / "data", folder / "train", folder / "test")
@@ -29,7 +31,7 @@ def test_names_of_folders_are_no_code(tmp_path: Path, monkeypatch: pytest.Monkey
     assert [path.name for path in tmp_path.iterdir()] == [folder.name]
 
 
-def test_a_program_that_is_not_there_is_missed_before_the_work() -> None:
+def test_missing_program_is_reported_before_the_work() -> None:
     check_trainer(f"{sys.executable} {{data}}")
     with pytest.raises(EvaluationError, match="install"):
         check_trainer("./train {data}")

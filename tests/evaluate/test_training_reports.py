@@ -1,4 +1,4 @@
-"""Commands that render at milestones: what is kept of them, and tables and curves of a report."""
+"""Training commands that render at milestones, and the tables and curves of a report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from colmap_av1.evaluate.report.tables import milestones_table, renderings_table
 from colmap_av1.evaluate.training.splatting import Milestone
 from colmap_av1.evaluate.training.trainers import Split, Training, train
 
-# The test images, the darker the fewer iterations, and what it took to come so far.
+# Writes the test images, darker after fewer iterations, and the time taken.
 TRAINER = """
 import pathlib, sys, cv2
 test, renders = map(pathlib.Path, sys.argv[1:3])
@@ -35,7 +35,7 @@ NAMES = [f"{i}.png" for i in range(4)]
 
 @pytest.fixture
 def split(tmp_path: Path) -> Split:
-    """Four pictures; the trainer here reads no model."""
+    """Four images; this trainer needs no model."""
     made = Split(tmp_path / "data", tmp_path / "train", tmp_path / "test")
     rng = np.random.default_rng(0)
     halves = (made.data, NAMES), (made.train, NAMES[::2]), (made.test, NAMES[1::2])
@@ -61,7 +61,7 @@ def train_with(split: Split, program: str, milestones: tuple[int, ...] = (2, 6))
     )
 
 
-def test_a_command_renders_at_milestones(split: Split) -> None:
+def test_command_renders_at_milestones(split: Split) -> None:
     training = train_with(split, TRAINER, (6, 2, 8, 20))
     states = [(state.iteration, state.seconds, state.num_gaussians) for state in training.states]
     assert states == [(2, 4, 200), (6, 12, 600), (8, 16, 800)]
@@ -70,7 +70,7 @@ def test_a_command_renders_at_milestones(split: Split) -> None:
     assert (training.seconds, training.metrics.psnr_y.tolist()) == (16, [60, 60])
     assert [path.parent.name for path in training.renders] == ["8", "8"]
 
-    # It is kept, times that are not known, too.
+    # The result is kept, also if the times are unknown.
     again = train_with(split, TRAINER, (6, 2))
     assert [state.mean("vmaf") for state in again.states] == [
         state.mean("vmaf") for state in training.states
@@ -91,7 +91,9 @@ def test_a_command_renders_at_milestones(split: Split) -> None:
         ("{2 * stop}", "nan", r"times\.csv"),
     ],
 )
-def test_what_a_command_did_not_write(split: Split, old: str, new: str, message: str) -> None:
+def test_missing_output_of_a_command_is_reported(
+    split: Split, old: str, new: str, message: str
+) -> None:
     assert old in TRAINER
     with pytest.raises(EvaluationError, match=message):
         train_with(split, TRAINER.replace(old, new))
@@ -99,7 +101,7 @@ def test_what_a_command_did_not_write(split: Split, old: str, new: str, message:
 
 
 def column(name: str, *states: tuple[int, float, float]) -> Column:
-    """A column with a training whose (iterations, seconds, PSNR-Y) these are."""
+    """A column of a training with these (iterations, seconds, PSNR-Y)."""
     found = tuple(
         Milestone(
             *(iteration, seconds, None),
@@ -117,8 +119,8 @@ def column(name: str, *states: tuple[int, float, float]) -> Column:
     return Column(name, training=Training(found[-1].seconds, found, [], [], [], found[-1].metrics))
 
 
-def test_tables_of_a_report() -> None:
-    """Held against SIFT's, after the same iterations and the same time."""
+def test_report_tables() -> None:
+    """Compared with SIFT after the same number of iterations and after the same time."""
     sift = column("sift-sequential", (10, 20.0, 20.0), (30, 80.0, 26.0))
     own = column("av1", (10, 30.0, 25.0), (30, 50.0, 27.0))
     bare = Column("disk")
@@ -140,14 +142,14 @@ def test_tables_of_a_report() -> None:
         ],
     ]
     assert milestones_table([bare]) is None
-    # Without SIFT nothing is a baseline, without times nothing is after seconds.
+    # Without SIFT there is no baseline; without times there are no columns in seconds.
     assert milestones_table([own]).header[1:] == ["10 iterations", "30 iterations"]
     assert "baseline is" not in renderings_table([own]).about
     untimed = column("sift-exhaustive", (10, np.nan, 20.0))
     assert milestones_table([untimed, sift, own]).header[1:] == ["10 iterations", "30 iterations"]
 
 
-def test_curves_of_a_report() -> None:
+def test_report_curves() -> None:
     pictures = pytest.importorskip("colmap_av1.evaluate.report.pictures")
     timed = column("av1", (10, 30.0, 25.0), (30, 50.0, 27.0))
     assert pictures.training_chart([Column("disk")]) is None

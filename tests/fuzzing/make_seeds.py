@@ -1,8 +1,8 @@
-"""Writes the seeds of `readers`: small files of each kind, as other programs write them.
+"""Writes the seeds of `readers`: small files of each kind in the formats of other programs.
 
     python tests/fuzzing/make_seeds.py
 
-The committed ones in tests/data/seeds were made so.
+It wrote the committed seeds in tests/data/seeds.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ENCODE = "-c:v libaom-av1 -usage realtime -cpu-used 8 -crf 50 -b:v 0 -g 2 -pix_
 
 
 def containers(folder: Path) -> dict[str, bytes]:
-    """A tiny clip in the containers that have AV1."""
+    """A tiny clip in all containers that support AV1."""
     ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y"]
     source = ["-f", "lavfi", "-i", "testsrc2=size=64x48:rate=5", "-frames:v", "4"]
     source += ["-fflags", "+bitexact"]
@@ -65,7 +65,7 @@ def annex_b(ivf: bytes) -> bytes:
 
 
 def leb128(value: int) -> bytes:
-    """A number of any length (4.10.5)."""
+    """A number in the leb128 format (4.10.5)."""
     data = b""
     while value > 127:
         data, value = data + bytes([value & 127 | 128]), value >> 7
@@ -88,7 +88,7 @@ def hdf5(folder: Path) -> bytes:
 
 
 def model() -> bytes:
-    """Two images that see a point."""
+    """A model of two images that observe a point."""
     image = [
         struct.pack("<I7dI", i, 1, 0, 0, 0, i, 0, 0, 1)
         + f"{i}.png".encode()

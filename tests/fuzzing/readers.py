@@ -1,6 +1,6 @@
-"""Targets that feed any bytes to the readers of files: containers, HDF5, models, databases.
+"""Fuzz targets of the file readers: containers, HDF5, models, databases.
 
-`with_atheris` runs them guided by coverage; the tests run all of them on damaged seeds.
+`with_atheris` runs them with coverage guidance; the tests run all of them on damaged seeds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _MODEL = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 
 
 def container(data: bytes, folder: Path) -> None:
-    """Any bytes as a video file, whatever FFmpeg takes them for."""
+    """Read the bytes as a video file, in any format that FFmpeg detects."""
     path = folder / "video"
     path.write_bytes(data)
     options = ReadOptions(num_threads=1, max_frame_size=256 * 256)
@@ -31,7 +31,7 @@ def container(data: bytes, folder: Path) -> None:
 
 
 def hdf5(data: bytes, folder: Path) -> None:
-    """Any bytes as a file of features, and those after it as one of matches."""
+    """Read the bytes as a file of features followed by a file of matches."""
     paths = [folder / "features.h5", folder / "matches.h5"]
     for path, part in zip(paths, split(data, 2), strict=True):
         path.write_bytes(part)
@@ -39,14 +39,14 @@ def hdf5(data: bytes, folder: Path) -> None:
 
 
 def model(data: bytes, folder: Path) -> None:
-    """Any bytes as the five files of a model."""
+    """Read the bytes as the five files of a model."""
     for name, part in zip(_MODEL, split(data, len(_MODEL)), strict=True):
         (folder / name).write_bytes(part)
     read_model(folder)
 
 
 def database(data: bytes, folder: Path) -> None:
-    """Any bytes as a database."""
+    """Read the bytes as a database."""
     path = folder / "a.db"
     path.write_bytes(data)
     check_database(path)
@@ -62,12 +62,12 @@ TARGETS: dict[str, Callable[[bytes, Path], None]] = {
 
 
 def joined(parts: list[bytes]) -> bytes:
-    """An input of several files: each with its length in four bytes before it."""
+    """Join files to one input; each is preceded by its length in four bytes."""
     return b"".join(struct.pack("<I", len(part)) + part for part in parts)
 
 
 def split(data: bytes, count: int) -> list[bytes]:
-    """The files of an input; a length beyond the end means what is left."""
+    """The files of an input; a length beyond the end means the rest."""
     parts = []
     for _ in range(count):
         (length,) = struct.unpack("<I", data[:4].ljust(4, b"\0"))
@@ -77,7 +77,7 @@ def split(data: bytes, count: int) -> list[bytes]:
 
 
 def run(target: str, data: bytes) -> str | None:
-    """What a target says of an input, in one line; None where it takes it."""
+    """Run a target; returns its error message of one line, or None if it accepts the input."""
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

@@ -1,6 +1,6 @@
-"""Readers of files on damaged seeds: an error of the package in one line, or what is left.
+"""File readers give a one-line error of the package or a result for damaged seeds.
 
-COLMAP_AV1_EXAMPLES sets how many are tried of each kind.
+COLMAP_AV1_EXAMPLES sets the number of examples of each kind.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ def seeds(target: str) -> list[bytes]:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_seeds_are_taken(target: str) -> None:
-    """Else damage to them would show little."""
+def test_seeds_are_accepted(target: str) -> None:
+    """Otherwise damage to them would test little."""
     assert [run(target, data) for data in seeds(target)] == [None] * len(seeds(target))
 
 
-# A share of a file, and what stands there then: bytes, or a number as headers hold it.
+# A relative position in a file, and the new content: bytes, or a number as used in headers.
 _CHANGES = st.lists(
     st.tuples(
         st.floats(0, 0.999),
@@ -43,7 +43,7 @@ _CHANGES = st.lists(
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_damaged_seeds(target: str) -> None:
+def test_damaged_seeds_give_errors_of_the_package(target: str) -> None:
     @settings(
         max_examples=int(EXAMPLES or "60"),
         derandomize=EXAMPLES is None,

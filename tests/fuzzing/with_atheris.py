@@ -9,7 +9,7 @@ import sys
 
 import atheris
 
-# Coverage is counted of what is imported here.
+# Coverage is measured for these imports.
 with atheris.instrument_imports(include=["colmap_av1", "readers"]):
     import readers
 
