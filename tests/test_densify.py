@@ -17,7 +17,7 @@ from colmap_av1.video.decoding import decode_frames
 
 
 def true_model(folder: Path, truth: Truth, frames: range, *, shuffle: int = 1) -> Path:
-    """A model without points that has the true poses, or those of other frames."""
+    """A model without points with the true poses, or with those of other frames if shuffled."""
     folder.mkdir()
     images = [
         ModelImage(100 - i, f"{frame:04d}.png", 7, truth.cam_from_world[frame * shuffle % 60])
@@ -29,7 +29,7 @@ def true_model(folder: Path, truth: Truth, frames: range, *, shuffle: int = 1) -
 
 @pytest.fixture(scope="module")
 def dense(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> pycolmap.Reconstruction:
-    """The clip's true poses with points."""
+    """A dense model with the true poses of the clip."""
     folder = tmp_path_factory.mktemp("dense")
     model = true_model(folder / "model", truth, range(60))
     options = DensifyOptions(
@@ -45,8 +45,10 @@ def dense(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> pycolmap.Re
     return made
 
 
-def test_densify_on_true_poses(truth: Truth, dense: pycolmap.Reconstruction) -> None:
-    """Points lie where the rendered clip's depth says, and in its colours."""
+def test_densify_gives_correct_depths_and_colours(
+    truth: Truth, dense: pycolmap.Reconstruction
+) -> None:
+    """Depths and colours agree with those of the rendered clip."""
     assert list(dense.cameras) == [7]
     fx, fy, cx, cy = truth.camera.params
     wrong, num_checked = [], 0
@@ -58,7 +60,7 @@ def test_densify_on_true_poses(truth: Truth, dense: pycolmap.Reconstruction) -> 
         x, y, z = truth.cam_from_world[frame] @ np.column_stack([xyz, np.ones(len(xyz))]).T
         column = np.abs((fx * x / z + cx)[:, None] - truth.depth_x).argmin(axis=1)
         row = np.abs((fy * y / z + cy)[:, None] - truth.depth_y).argmin(axis=1)
-        # Depth is known on a grid: its neighbourhood tells where it is smooth.
+        # The true depth is known on a grid, so only compare where it is smooth.
         padded = np.pad(truth.depth[frame], 1, mode="edge")
         around = np.stack([padded[row + i, column + j] for i in range(3) for j in range(3)])
         smooth = around.max(axis=0) / around.min(axis=0) < 1.1
@@ -78,7 +80,7 @@ def test_densify_on_true_poses(truth: Truth, dense: pycolmap.Reconstruction) -> 
 
 
 def test_points_lie_on_the_surfaces(truth: Truth, dense: pycolmap.Reconstruction) -> None:
-    """Those that three frames see, too; errors are shares of the distance from the camera."""
+    """Including points observed in three frames; errors are relative to the camera distance."""
     points = list(dense.points3D.values())
     length = np.array([p.track.length() for p in points])
     first = [Path(dense.images[p.track.elements[0].image_id].name).stem for p in points]
@@ -96,7 +98,7 @@ def test_points_lie_on_the_surfaces(truth: Truth, dense: pycolmap.Reconstruction
 
 
 def model_of_clip(folder: Path) -> Path:
-    """The clip's layers move by 2 and 4 px a frame, as at distances of 100 and 50 steps."""
+    """A model for the clip, whose layers move by 2 and 4 px per frame."""
     folder.mkdir()
     camera = pycolmap.Camera(
         camera_id=1, model="PINHOLE", width=192, height=128, params=[200, 200, 96, 64]
@@ -110,7 +112,7 @@ def model_of_clip(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("when", ["motion", "colours"])
-def test_video_that_changes(clip: Path, tmp_path: Path, when: str) -> None:
+def test_changed_video_is_refused(clip: Path, tmp_path: Path, when: str) -> None:
     model = model_of_clip(tmp_path / "model")
     video = tmp_path / "v.mp4"
     shutil.copyfile(clip, video)
@@ -125,7 +127,7 @@ def test_video_that_changes(clip: Path, tmp_path: Path, when: str) -> None:
     assert densify(model, video, tmp_path / "dense").num_points > 500
 
 
-def test_densify_refuses_what_does_not_fit(truth: Truth, clip: Path, tmp_path: Path) -> None:
+def test_densify_refuses_mismatched_models(truth: Truth, clip: Path, tmp_path: Path) -> None:
     model = true_model(tmp_path / "model", truth, range(60))
     with pytest.raises(ImageError, match="640x360"):
         densify(model, clip, tmp_path / "dense")

@@ -1,4 +1,4 @@
-"""Documents and scripts name options that exist."""
+"""Documents and scripts only name existing options, and links and tables are valid."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GUIDE = sorted((PROJECT / "docs").glob("*.md"))
 DOCUMENTS = [PROJECT / "README.md", *GUIDE, *sorted((PROJECT / "examples").rglob("*.md"))]
 SCRIPTS = sorted((PROJECT / "examples").rglob("*.sh"))
 PROGRAM = re.compile(r"(?:^|[\s`'(])(?:colmap-av1|python -m colmap_av1) ([a-z]+)([^`\n]*)")
-# Scripts of examples/pipelines hand what comes after the video and a folder to `match`.
+# Scripts in examples/pipelines pass arguments after the video and the folder to `match`.
 PIPELINE = re.compile(r"[\w/]*(?:pipelines/)?\w+\.sh([^`\n]*)")
 
 
@@ -31,19 +31,19 @@ def commands() -> dict[str, argparse.ArgumentParser]:
 
 
 def code_of(path: Path) -> str:
-    """A script, or the code of a Markdown file; a line for each command."""
+    """A script, or the code in a Markdown file, with one line per command."""
     text = path.read_text().replace("\\\n", " ")
     if path.suffix == ".sh":
         return text
     blocks = re.findall(r"^```\w*\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
     outside = re.sub(r"^```\w*\n.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
-    # Code within a paragraph may be broken over two lines.
+    # Inline code may be broken over two lines.
     inline = [" ".join(piece.split()) for piece in re.findall(r"`([^`]+)`", outside)]
     return "\n".join([*blocks, *inline])
 
 
 def named_options(rest: str) -> list[str]:
-    """The options among the words after a command, up to the end of it."""
+    """The options among the arguments of a command."""
     return [
         underscored(o) for o in re.findall(r"(?<!\S)--\w[\w.-]*", re.split(r"[#|&;>]", rest)[0])
     ]
@@ -57,7 +57,7 @@ def uses(path: Path) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("path", [*DOCUMENTS, *SCRIPTS], ids=lambda p: str(p.relative_to(PROJECT)))
-def test_options_exist(path: Path) -> None:
+def test_options_in_documents_exist(path: Path) -> None:
     known = commands()
     unknown = [
         f"{command} {option}"
@@ -67,8 +67,8 @@ def test_options_exist(path: Path) -> None:
     assert unknown == []
 
 
-def test_options_are_found() -> None:
-    """What the other test looks at is there."""
+def test_options_in_documents_are_found() -> None:
+    """Otherwise the test of existing options would test nothing."""
     assert ("match", "--num_images") in uses(PROJECT / "README.md")
     assert ("match", "--on_existing") in uses(PROJECT / "docs" / "databases.md")
     assert ("match", "--every") in uses(PROJECT / "examples" / "pipelines" / "README.md")
@@ -77,7 +77,7 @@ def test_options_are_found() -> None:
     assert all(uses(script) for script in SCRIPTS)
 
 
-def test_links_between_documents_lead_somewhere() -> None:
+def test_links_between_documents_are_valid() -> None:
     for path in DOCUMENTS:
         for target, anchor in re.findall(r"\]\(([\w./]*)(?:#([\w-]+))?\)", path.read_text()):
             file = path.parent / target if target else path
@@ -98,15 +98,15 @@ def test_guide_builds_without_warnings(tmp_path: Path) -> None:
     assert 'id="colmap_av1.tracks.tracks.Tracks"' in page
 
 
-def test_tables_are_those_of_the_results() -> None:
-    """The documents hold what `render.py` makes of the CSV files."""
+def test_tables_match_the_results() -> None:
+    """The documents contain the tables that `render.py` makes from the CSV files."""
     script = PROJECT / "examples" / "benchmarks" / "render.py"
     command = [sys.executable, script, "--check"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_results_take_the_place_of_those_of_the_same_clip(tmp_path: Path) -> None:
+def test_results_replace_those_of_the_same_clip(tmp_path: Path) -> None:
     source = PROJECT / "examples" / "benchmarks" / "results.py"
     spec = importlib.util.spec_from_file_location("benchmark_results", source)
     assert spec is not None
@@ -121,11 +121,11 @@ def test_results_take_the_place_of_those_of_the_same_clip(tmp_path: Path) -> Non
     assert all(row["commit"] and row["machine"].endswith(results.machine()) for row in rows)
 
 
-def test_loose_options_of_documents_exist() -> None:
-    """Options that a text names alone are those of some command, or of a script beside it."""
+def test_options_named_without_a_command_exist() -> None:
+    """They are options of some command or of a script in examples."""
     known = {o for parser in commands().values() for o in parser._option_string_actions}
     scripts = [p.read_text() for p in (PROJECT / "examples").rglob("*.*") if p.suffix == ".py"]
-    # The page of trainers names options of theirs.
+    # The page about trainers names options of the trainers.
     for path in (p for p in DOCUMENTS if p.name != "trainers.md"):
         outside = re.sub(r"^```\w*\n.*?^```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
         for piece in re.findall(r"`(--\w[^`]*)`", outside):

@@ -1,4 +1,4 @@
-"""The examples in the docstrings of the public API run."""
+"""The examples in the docstrings of the public API work."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import colmap_av1
 
 FUNCTIONS = [name for name in colmap_av1.__all__ if name.islower()]
 CLASSES = ["FrameMotion", "MatchOptions", "ReconstructOptions", "Tracks"]
-# Examples that read what another example writes.
+# Examples that read the output of another example.
 NEEDS = {
     "check_database": "match",
     "check_model": "map_database",
@@ -26,13 +26,13 @@ NEEDS = {
     "write_page": "run_batch",
 }
 
-# Runs the example of a name, and returns the number of its statements and its failures.
+# Runs the example of a name; returns the number of statements and the failures.
 Run = Callable[[str], tuple[int, str]]
 
 
 @pytest.fixture(scope="module")
 def run(ffmpeg: Ffmpeg, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
-    """Run examples, each once, in a folder with the videos that they name."""
+    """Run each example once, in a folder with the videos that the examples name."""
     folder = tmp_path_factory.mktemp("examples")
     scene = PROJECT / "examples" / "scene.mp4"
     shutil.copyfile(scene, folder / "video.mp4")
@@ -48,7 +48,7 @@ def run(ffmpeg: Ffmpeg, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ru
         text = inspect.getdoc(getattr(colmap_av1, name)) or ""
         example = doctest.DocTestParser().get_doctest(text, {}, name, None, 0)
         failures: list[str] = []
-        # Not verbose, or pytest's -v would be taken for doctest's.
+        # Otherwise doctest would interpret pytest's option -v.
         runner = doctest.DocTestRunner(verbose=False, optionflags=doctest.ELLIPSIS)
         runner.run(example, out=failures.append)
         return len(example.examples), "".join(failures)
@@ -59,7 +59,7 @@ def run(ffmpeg: Ffmpeg, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ru
 
 
 @pytest.mark.parametrize("name", [*FUNCTIONS, *CLASSES])
-def test_example(run: Run, name: str) -> None:
+def test_docstring_example_works(run: Run, name: str) -> None:
     count, failures = run(name)
     assert count > 0, f"the docstring of {name} has no example"
     assert failures == ""

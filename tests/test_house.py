@@ -1,4 +1,4 @@
-"""The package's layout: imports run down the flow."""
+"""The layout of the package: folders only import earlier folders."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from conftest import PROJECT
 
 PACKAGE = PROJECT / "colmap_av1"
 
-# A folder may import itself and the folders before it.
+# A folder may import itself and earlier folders.
 FLOW = (
     *("errors", "options", "util", "video", "motion", "tracks", "geometry", "images", "matching"),
     *("database", "poses", "splats", "check", "interop", "commands", "evaluate", "compare", "cli"),
 )
-# Modules at the top are commands, but for these.
+# Other top-level modules are commands.
 AT_THE_TOP = {"errors": "errors", "options": "options", "compare": "compare"}
 
 
 def modules() -> dict[str, Path]:
-    """The package's modules but its roots, by dotted name without the package's."""
+    """Modules of the package by dotted name, without `__init__` and `__main__`."""
     paths = [p for p in PACKAGE.rglob("*.py") if "csrc" not in p.parts]
     names = {".".join(p.relative_to(PACKAGE).with_suffix("").parts): p for p in paths}
     return {name: p for name, p in names.items() if name not in ("__init__", "__main__")}
@@ -33,7 +33,7 @@ def folder_of(name: str) -> str:
 
 
 def imported(path: Path) -> set[str]:
-    """Modules of the package that a module imports, without the package's name."""
+    """Modules of the package that a module imports, without the name of the package."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("colmap_av1."):
@@ -41,7 +41,7 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-def test_imports_run_down_the_flow() -> None:
+def test_folders_only_import_earlier_folders() -> None:
     climbs = [
         f"{name} imports {other}"
         for name, path in modules().items()

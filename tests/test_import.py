@@ -1,4 +1,4 @@
-"""The import of the package: lazy, without side effects, and refused where it cannot work."""
+"""Importing the package is lazy, has no side effects, and explains a missing extension."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def run_python(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
-def test_import_loads_no_libraries_and_installs_nothing(tmp_path: Path) -> None:
+def test_import_loads_no_libraries_and_has_no_side_effects(tmp_path: Path) -> None:
     run = run_python(
         "import signal, sys, threading\n"
         "handlers = [signal.getsignal(n) for n in signal.valid_signals()]\n"
@@ -48,7 +48,7 @@ def test_every_public_name_exists() -> None:
 
 
 def test_numpy_is_imported_before_pycolmap(tmp_path: Path) -> None:
-    """In the other order the writing of a PNG file ends the process."""
+    """In the other order, writing a PNG file crashes the process."""
     for name in ("check_database", "check_model", "reconstruct"):
         run = run_python(
             f"import colmap_av1, sys; colmap_av1.{name}; print(*sys.modules)", tmp_path
@@ -57,7 +57,7 @@ def test_numpy_is_imported_before_pycolmap(tmp_path: Path) -> None:
         assert loaded.index("numpy") < loaded.index("pycolmap")
 
 
-def test_source_without_the_core_says_what_to_do(tmp_path: Path) -> None:
+def test_import_without_the_core_explains_how_to_build(tmp_path: Path) -> None:
     shutil.copytree(
         PROJECT / "colmap_av1",
         tmp_path / "colmap_av1",

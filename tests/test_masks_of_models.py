@@ -1,4 +1,4 @@
-"""Masks in models: no point of what they leave out, and masks for trainers."""
+"""Masks in models: masked pixels have no points, and trainers get masks."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from colmap_av1.video.decoding import decode_frames
 
 SCENE = Path(__file__).resolve().parents[1] / "examples" / "scene.mp4"
 SIZE = (320, 180)
-# The lens bends: masks are undistorted as images are.
+# With a distorted lens, masks are undistorted like images.
 MATCH = MatchOptions(
     images=ImageOptions(every=2, image_name="frame_%06d.jpg"),
     camera=CameraOptions(camera_model="SIMPLE_RADIAL", camera_params="260,160,90,0.05"),
 )
-# What is left out moves from frame to frame.
+# The masked region moves from frame to frame.
 NUM_FRAMES, STEP = 18, 5
 
 
@@ -66,7 +66,7 @@ def masked(scene: Scene) -> MatchOptions:
 
 
 def seen_on_black(model: Path, masks: Path) -> tuple[int, int]:
-    """Observations on black pixels of the images' masks, and all."""
+    """Number of observations on black pixels of the masks, and of all observations."""
     reconstruction = pycolmap.Reconstruction(model)
     on_black = total = 0
     for image in reconstruction.images.values():
@@ -77,16 +77,16 @@ def seen_on_black(model: Path, masks: Path) -> tuple[int, int]:
     return on_black, total
 
 
-def test_no_point_is_seen_on_a_mask(made: ReconstructReport) -> None:
+def test_no_point_is_observed_on_a_mask(made: ReconstructReport) -> None:
     on_black, total = seen_on_black(made.output / "sparse" / "0", made.output / "masks")
     assert total > 5_000
-    # Edges are rounded where masks are undistorted.
+    # Undistorted masks have rounded edges.
     assert on_black <= 0.002 * total
     assert made.coverage > 0.9
 
 
-def test_trainers_find_a_mask_for_each_image(scene: Scene, made: ReconstructReport) -> None:
-    """Black where what is left out lies in the undistorted images, of their size."""
+def test_each_image_gets_a_mask_for_trainers(scene: Scene, made: ReconstructReport) -> None:
+    """The masks have the size of the undistorted images and are black in the masked region."""
     (camera,) = pycolmap.Reconstruction(made.output / "sparse" / "0").cameras.values()
     images = sorted((made.output / "images").iterdir())
     masks = sorted((made.output / "masks").iterdir())
@@ -107,7 +107,7 @@ def test_trainers_find_a_mask_for_each_image(scene: Scene, made: ReconstructRepo
         assert np.mean((mask.ravel() == 0) == black) > 0.995
 
 
-def test_masks_of_original_pictures_are_those_given(
+def test_masks_without_undistortion_are_the_given_ones(
     scene: Scene, made: ReconstructReport, tmp_path: Path
 ) -> None:
     output = tmp_path / "out"
@@ -124,7 +124,7 @@ def test_masks_of_original_pictures_are_those_given(
 
 
 def test_colmap_reads_the_masks_of_png_images(made: ReconstructReport, tmp_path: Path) -> None:
-    """COLMAP's extractor finds no feature on what is black."""
+    """COLMAP extracts no features on black pixels."""
     images = tmp_path / "images"
     images.mkdir()
     names = [f"{path.stem}.png" for path in sorted((made.output / "images").iterdir())[:2]]
@@ -149,10 +149,8 @@ def test_colmap_reads_the_masks_of_png_images(made: ReconstructReport, tmp_path:
         assert (mask[y, x] > 0).all()
 
 
-def test_densify_leaves_out_what_masks_do(
-    scene: Scene, made: ReconstructReport, tmp_path: Path
-) -> None:
-    """The masks of the model's images, as `reconstruct` wrote them."""
+def test_densify_respects_masks(scene: Scene, made: ReconstructReport, tmp_path: Path) -> None:
+    """Uses the masks of the images that `reconstruct` wrote."""
     match = MatchOptions(
         images=ImageOptions(first_number=0), masks=MaskOptions(mask_path=made.output / "masks")
     )
@@ -163,10 +161,10 @@ def test_densify_leaves_out_what_masks_do(
     assert on_black == 0
 
 
-def test_other_masks_make_another_model(
+def test_changed_masks_change_the_model(
     scene: Scene, made: ReconstructReport, tmp_path: Path
 ) -> None:
-    """A resumed run looks at the masks' content; without masks none are left for trainers."""
+    """A resumed run compares the content of masks; without masks, trainers' masks are removed."""
     assert not made.resumed
     options = ReconstructOptions(match=masked(scene))
     again = reconstruct(scene.video, made.output, options=options)

@@ -1,4 +1,4 @@
-"""What programs get wrong that call the package: an error that names it, and nothing hangs."""
+"""Wrong calls of the Python API give an error that names the argument, and do not hang."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from colmap_av1.video.container import open_stream
 VIDEO = PROJECT / "tests" / "data" / "conformance" / "svt4_p6.ivf"
 
 
-def test_motion_that_is_none() -> None:
+def test_invalid_motion_is_refused() -> None:
     for value in ("text", b"bytes", [1]):
         with pytest.raises(TypeError, match="motion"):
             build_tracks(value)
 
 
 @pytest.mark.parametrize("number", [1 << 31, 1 << 40, 1 << 80, -(1 << 31) - 1])
-def test_integers_past_32_bits(number: int) -> None:
+def test_integers_beyond_32_bits_are_refused(number: int) -> None:
     with pytest.raises(OptionError, match="operating_point"):
         ReadOptions(operating_point=number)
     with pytest.raises(OptionError, match="num_threads"):
@@ -47,7 +47,7 @@ def test_integers_past_32_bits(number: int) -> None:
             build_tracks([dataclasses.replace(frame, **{field: number})])
 
 
-def test_arrays_of_other_shapes() -> None:
+def test_arrays_of_wrong_shape_are_refused() -> None:
     frame = next(iter(read_motion(VIDEO)))
     for field in ("mv", "ref_frame", "mi_size", "warp_index", "ref_size"):
         values = getattr(frame, field)
@@ -59,8 +59,8 @@ def test_arrays_of_other_shapes() -> None:
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs the processes of a Unix")
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.parametrize("num_threads", [1, 4])
-def test_fork_while_a_video_is_read(num_threads: int) -> None:
-    """The new process is told, and the old one goes on as if nothing were."""
+def test_fork_while_reading_is_an_error_in_the_child(num_threads: int) -> None:
+    """The child gets an error, and the parent continues to read."""
     wanted = [frame.decode_index for frame in read_motion(VIDEO)]
     frames = read_motion(VIDEO, ReadOptions(num_threads=num_threads))
     found = [next(frames).decode_index]
@@ -81,10 +81,10 @@ def test_fork_while_a_video_is_read(num_threads: int) -> None:
 
 
 @pytest.mark.parametrize("num_threads", [1, 4])
-def test_memory_goes_with_the_error(
+def test_failed_reader_is_freed_with_its_error(
     num_threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the garbage collector: nothing of a failed reader refers to itself."""
+    """A failed reader has no reference cycles, so the garbage collector is not needed."""
     data = bytearray(VIDEO.read_bytes())
     (size,) = struct.unpack_from("<I", data, 32)
     data[44 + size // 2 : 44 + size] = bytes(size - size // 2)  # a hole

@@ -1,4 +1,4 @@
-"""The scripts for other tools, run with COLMAP's command and stand-ins for what is no package."""
+"""The pipeline scripts run with COLMAP's command and stand-ins for tools without a package."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def video(ffmpeg: Ffmpeg, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Every seventh frame of the example clip, at three quarters of its size."""
+    """Every seventh frame of the example clip, at three quarters of the size."""
     every = [
         "-vf",
         "select=not(mod(n\\,7)),setpts=N/25/TB,scale=480:270:flags=area",
@@ -45,10 +45,10 @@ def video(ffmpeg: Ffmpeg, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def tools(tmp_path: Path) -> Path:
-    """A folder of commands: this package, this Python, an ffmpeg, stand-ins for others."""
+    """A folder of commands: this package, this Python, ffmpeg, and stand-ins for other tools."""
     folder = tmp_path / "tools"
     folder.mkdir()
-    # Without the working folder on the path: the checkout would hide the installed package.
+    # Without the working folder on the path, which would hide the installed package.
     path = "import sys; sys.path[:] = filter(None, sys.path)"
     program = f"{path}; from colmap_av1.cli import main; sys.exit(main())"
     add_command(folder, "colmap-av1", f'exec "{sys.executable}" -c "{program}" "$@"')
@@ -99,7 +99,7 @@ def test_colmap(tmp_path: Path, tools: Path, video: Path) -> None:
 
 
 def test_colmap_with_sift(tmp_path: Path, tools: Path, video: Path) -> None:
-    """The model has points of both kinds."""
+    """The model has points from tracks and from SIFT."""
     run(
         *("colmap_with_sift.sh", tools, video, tmp_path / "work", *FEW),
         EXTRACTOR_OPTIONS="--SiftExtraction.use_gpu 0 --SiftExtraction.max_num_features 600 "
@@ -122,7 +122,7 @@ def test_colmap_with_sift(tmp_path: Path, tools: Path, video: Path) -> None:
 
 
 def test_colmap_dense(tmp_path: Path, tools: Path, video: Path) -> None:
-    """The poses are the mapper's, and the points many more."""
+    """The dense model has the poses of the mapper and many more points."""
     run("colmap_dense.sh", tools, video, tmp_path / "my work", "--preset", "sparse")
     sparse = largest_model(tmp_path / "my work/sparse")
     dense = pycolmap.Reconstruction(tmp_path / "my work/dense")
@@ -132,7 +132,7 @@ def test_colmap_dense(tmp_path: Path, tools: Path, video: Path) -> None:
         assert np.allclose(image.cam_from_world().matrix(), poses[image.name], atol=1e-6)
 
 
-# What convert.py does when told to skip the matching: undistort, and move the model.
+# A stand-in for convert.py with --skip_matching: undistorts the images and moves the model.
 CONVERT = """
     import argparse, pathlib, subprocess
     parser = argparse.ArgumentParser()
@@ -161,13 +161,13 @@ def test_gaussian_splatting(tmp_path: Path, tools: Path, video: Path) -> None:
     model = pycolmap.Reconstruction(tmp_path / "source/sparse/0")
     assert [camera.model_name for camera in model.cameras.values()] == ["PINHOLE"]
     check_model(model, tmp_path / "source/images", least_points=3000)
-    # Points that fill holes, too, go through COLMAP's undistortion.
+    # COLMAP's undistortion also keeps points that fill holes.
     assert model.num_points3D() == pycolmap.Reconstruction(dense).num_points3D()
     assert largest_model(tmp_path / "source/distorted/mapped").num_points3D() < 3000
 
 
-# What ns-process-data does when told to skip COLMAP: copy the images under names of its own,
-# and write the cameras of the model under these.
+# A stand-in for ns-process-data with --skip-colmap: copies the images under new names and writes
+# the cameras of the model with these names.
 NERFSTUDIO = """
     import argparse, json, pathlib, shutil
     import numpy, pycolmap
@@ -204,7 +204,7 @@ def test_nerfstudio(tmp_path: Path, tools: Path, video: Path) -> None:
     assert all(file.is_file() for file in files)
 
 
-# What hloc.reconstruction does: import images, features and matches, verify, map.
+# A stand-in for hloc.reconstruction: imports images, features and matches, verifies and maps.
 HLOC = """
     import argparse, pathlib
     import h5py, numpy, pycolmap

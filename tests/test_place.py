@@ -1,4 +1,4 @@
-"""Positions and gravity of real containers, through matching and mapping to a model in metres."""
+"""Positions and gravity in containers place a model in metres."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from colmap_av1.poses.placing.placement import Origin
 from colmap_av1.reconstruct import ReconstructReport
 
 ORIGIN = (59.33, 18.07, 20.0)
-# The scene is small beside the errors of receivers: its camera moves 10 times as far here.
+# The scene is enlarged tenfold, because it is small compared with GPS errors.
 LARGER = 10.0
 
 
 def places_of(truth: Truth) -> np.ndarray:
-    """Latitude, longitude and altitude of each frame, with the errors of a receiver."""
+    """Latitude, longitude and altitude of each frame, with GPS errors."""
     rng = np.random.default_rng(0)
     metres = LARGER * camera_centres(truth.cam_from_world)
     metres = metres + rng.normal(0, 0.3, metres.shape)
-    metres[[9, 30]] += [[200.0, 0, 0], [0, -50, 0]]  # two that jump
+    metres[[9, 30]] += [[200.0, 0, 0], [0, -50, 0]]  # two outliers
     return np.asarray(pycolmap.GPSTransform().enu_to_ellipsoid(metres, *ORIGIN))
 
 
@@ -39,7 +39,7 @@ def frame_of(name: str) -> int:
 
 
 def away(model: Path, truth: Truth, origin: Origin | None) -> tuple[float, float, float]:
-    """Largest distance in metres of the cameras from the truth, scale, and degrees off level."""
+    """Maximum camera error in metres, scale, and tilt in degrees."""
     images = posed_images(read_model(model))
     frames = [frame_of(name) for name in images]
     poses = np.array([image.cam_from_world for image in images.values()])
@@ -59,7 +59,7 @@ def away(model: Path, truth: Truth, origin: Origin | None) -> tuple[float, float
 
 @pytest.fixture(scope="module")
 def placed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> ReconstructReport:
-    """The scene with the track of a GoPro, whose axes are turned against the picture's."""
+    """The scene with the telemetry of a GoPro, whose axes differ from those of the picture."""
     folder = tmp_path_factory.mktemp("placed")
     places = places_of(truth)
     gravity = (truth.cam_from_world[:, :, :3] @ [0, 0, -1.0])[:, [2, 0, 1]] * [1, -1, 1]
@@ -70,7 +70,7 @@ def placed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Reconstruc
     return reconstruct(video, folder / "out", options=OPTIONS)
 
 
-def test_model_in_metres_by_a_gopro(placed: ReconstructReport, truth: Truth) -> None:
+def test_gopro_telemetry_gives_a_model_in_metres(placed: ReconstructReport, truth: Truth) -> None:
     assert placed.place.units == "metres"
     assert placed.place.axes == "x east, y north, z up"
     written = json.loads((placed.output / "place.json").read_text())
@@ -85,10 +85,10 @@ def test_model_in_metres_by_a_gopro(placed: ReconstructReport, truth: Truth) -> 
     assert abs(ground) < 2  # of a scene 10 times as large
 
 
-def test_database_says_where_images_were_taken(
+def test_database_contains_pose_priors(
     placed: ReconstructReport, truth: Truth, tmp_path: Path
 ) -> None:
-    """Read by pycolmap, which migrates it, and aligned to by `map`."""
+    """pycolmap can read them, and `map` aligns the model to them."""
     priors = read_pose_priors(placed.database)
     assert len(priors) == placed.num_key_images
     for name, prior in priors.items():
@@ -112,8 +112,8 @@ def test_database_says_where_images_were_taken(
     assert moved == {n: p.position.tolist() for n, p in priors.items()}
 
 
-def test_scale_and_up_without_positions(placed: ReconstructReport, truth: Truth) -> None:
-    """Redone from the placement on; a distance of the truth, and the truth's up."""
+def test_scale_and_up_from_a_distance_and_gravity(placed: ReconstructReport, truth: Truth) -> None:
+    """A resumed run only repeats the placement, with a known distance in place of positions."""
     video = placed.videos[0]
     centres = camera_centres(truth.cam_from_world)
     metres = float(np.linalg.norm(centres[3] - centres[48]))
@@ -136,10 +136,10 @@ def test_scale_and_up_without_positions(placed: ReconstructReport, truth: Truth)
     assert (again.output / "place.json").exists()
 
 
-def test_positions_that_stand_still_are_told(
+def test_identical_positions_are_reported(
     placed: ReconstructReport, truth: Truth, tmp_path: Path
 ) -> None:
-    """They are in the place where COLMAP 3.8 writes those of EXIF data."""
+    """The positions are in the columns that COLMAP 3.8 fills from EXIF data."""
     database = tmp_path / "still.db"
     shutil.copyfile(placed.database, database)
     with sqlite3.connect(database) as connection:

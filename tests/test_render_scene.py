@@ -1,4 +1,4 @@
-"""The example clip and its truth agree with each other and with themselves."""
+"""The example clip and its ground truth are consistent."""
 
 import av
 import cv2
@@ -40,21 +40,21 @@ def test_clip_has_one_picture_per_pose(scene, luma):
     assert (EXAMPLES / "scene.mp4").stat().st_size < 1_000_000
 
 
-def test_truth_file_is_the_scene(scene, truth):
-    # The last bits of a sine are the processor's.
+def test_truth_file_matches_the_scene(scene, truth):
+    # The last bits of a sine depend on the processor.
     np.testing.assert_allclose(truth["cam_from_world"], scene.cam_from_world, rtol=0, atol=1e-13)
     assert truth["cam_from_world"].dtype == np.float64
     for name in ("width", "height", "fx", "fy", "cx", "cy"):
         assert truth[name] == getattr(scene, name)
 
 
-def test_rotations_are_rotations(scene):
+def test_rotations_are_orthonormal(scene):
     for pose in scene.cam_from_world:
         np.testing.assert_allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(pose[:, :3]) == pytest.approx(1)
 
 
-def test_depth_map_is_the_scenes_depth(scene, truth):
+def test_depth_map_matches_the_scene(scene, truth):
     grid = np.stack(np.meshgrid(truth["depth_x"], truth["depth_y"]), -1)
     for frame in (0, 31, 59):
         points = render_scene.surface_points(scene, frame, grid.reshape(-1, 2))
@@ -62,7 +62,7 @@ def test_depth_map_is_the_scenes_depth(scene, truth):
         np.testing.assert_allclose(truth["depth"][frame], depth, rtol=2**-11)
 
 
-def test_projection_follows_the_stored_pose_and_intrinsics(truth, scene):
+def test_projection_uses_the_stored_pose_and_intrinsics(truth, scene):
     pose, point = truth["cam_from_world"][17], np.array([0.4, 0.2, 0.3])
     x, y, z = pose[:, :3] @ point + pose[:, 3]
     expected = [truth["fx"] * x / z + truth["cx"], truth["fy"] * y / z + truth["cy"]]
@@ -83,7 +83,7 @@ def test_surface_points_have_no_distance_to_the_surfaces(scene, frame):
 
 
 @pytest.mark.parametrize("frame", [0, 24, 59])
-def test_surface_points_project_to_where_they_were_seen(scene, frame):
+def test_surface_points_project_to_their_pixels(scene, frame):
     xy = _positions(scene, 4000, frame)
     points = render_scene.surface_points(scene, frame, xy)
     assert np.isfinite(points).all()
@@ -94,7 +94,7 @@ def test_surface_points_project_to_where_they_were_seen(scene, frame):
 
 
 @pytest.mark.parametrize(("a", "b"), [(0, 1), (10, 18), (59, 20), (0, 59)])
-def test_transfer_there_and_back(scene, a, b):
+def test_transfer_is_invertible(scene, a, b):
     xy = _positions(scene, 4000, 100 * a + b)
     there, visible = render_scene.transfer(scene, xy, a, b)
     assert 0.3 < visible.mean() <= 1
@@ -103,8 +103,8 @@ def test_transfer_there_and_back(scene, a, b):
     assert seen.all()
 
 
-def test_transfer_marks_what_is_hidden_or_outside(scene):
-    # Behind the ball, as seen from the first camera, lies the ground or a wall.
+def test_transfer_marks_hidden_and_outside_points(scene):
+    # A point behind the ball is hidden from the first camera.
     ball = next(s for s in scene.surfaces if s.material == "marble")
     pose = scene.cam_from_world[0]
     centre = -pose[:, :3].T @ pose[:, 3]
@@ -117,7 +117,7 @@ def test_transfer_marks_what_is_hidden_or_outside(scene):
     assert np.isnan(xy[2]).all()
 
 
-def test_camera_moves_as_a_hand_held_arc_does(scene):
+def test_camera_moves_along_a_hand_held_arc(scene):
     xy = _positions(scene, 2000, 5)
     for frame in range(0, 58, 6):
         there, visible = render_scene.transfer(scene, xy, frame, frame + 1)
@@ -143,7 +143,7 @@ def _disagreement(scene, luma, a, b, shifts):
     reference = luma[a][rows.ravel()[use], cols.ravel()[use]]
     errors = []
     for shift in shifts:
-        # cv2.remap counts from the first pixel's centre, and takes 32767 rows at most.
+        # cv2.remap has the origin at the centre of the first pixel, and accepts at most 32767 rows.
         moved = (xy[use] + shift - 0.5).astype(np.float32)
         moved = np.pad(moved, ((0, -len(moved) % 256), (0, 0))).reshape(-1, 256, 2)
         warped = cv2.remap(luma[b], moved, None, cv2.INTER_CUBIC).ravel()[: len(reference)]
@@ -152,7 +152,7 @@ def _disagreement(scene, luma, a, b, shifts):
 
 
 @pytest.mark.parametrize(("a", "b"), [(30, 31), (20, 28), (50, 42)])
-def test_decoded_pictures_follow_the_transfer(scene, luma, a, b):
+def test_decoded_pictures_agree_with_the_transfer(scene, luma, a, b):
     shifts = [[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]]
     exact, *shifted = _disagreement(scene, luma, a, b, shifts)
     assert exact < 0.4 * np.abs(luma[a] - luma[b]).mean()
@@ -160,8 +160,8 @@ def test_decoded_pictures_follow_the_transfer(scene, luma, a, b):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_decoded_pictures_agree_best_without_shift(scene, luma, axis):
-    # A parabola through the errors at -0.25, 0 and 0.25 px has its lowest point within 0.03 px.
+def test_decoded_pictures_have_no_subpixel_offset(scene, luma, axis):
+    # A parabola through the errors at -0.25, 0 and 0.25 px has its minimum within 0.03 px of 0.
     shifts = np.zeros((3, 2))
     shifts[:, axis] = -0.25, 0, 0.25
     errors = _disagreement(scene, luma, 33, 36, shifts)
@@ -170,9 +170,9 @@ def test_decoded_pictures_agree_best_without_shift(scene, luma, axis):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_outlines_lie_where_the_depth_jumps(scene, luma, axis):
-    # Warping hardly sees an offset that all frames share; an object's outline does. The steps in
-    # brightness across depth jumps must be as strong one pixel before as one pixel after them.
+def test_outlines_are_at_depth_discontinuities(scene, luma, axis):
+    # Warping hardly detects an offset common to all frames, but object outlines do. Brightness
+    # steps must be equally strong one pixel before and after depth discontinuities.
     profile = np.zeros(3)
     for frame in (5, 30, 55):
         rows, cols = np.mgrid[0 : scene.height, 0 : scene.width]

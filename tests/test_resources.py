@@ -1,4 +1,4 @@
-"""Small input that declares, or asks for, more than any memory holds: refused, and at once."""
+"""Small input that declares or requests more memory than exists is refused at once."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def refused(run: Callable[[], object], kind: type[ColmapAv1Error], text: str) ->
     "pattern",
     ["%99999999999d.png", "%021d.png", f"{'x' * 250}%d.png", "a\0%d.png", f"%{'0' * 5000}9d.png"],
 )
-def test_name_that_no_file_can_have(pattern: str) -> None:
+def test_invalid_image_name_pattern_is_refused(pattern: str) -> None:
     refused(lambda: ImageOptions(image_name=pattern), OptionError, "image_name")
 
 
-def test_list_without_an_end(tmp_path: Path) -> None:
+def test_endless_list_is_refused(tmp_path: Path) -> None:
     refused(
         lambda: check_frame_list(ImageOptions(frame_list="/dev/zero")),
         ImageError,
@@ -66,7 +66,7 @@ def test_list_without_an_end(tmp_path: Path) -> None:
     refused(lambda: check_frame_list(ImageOptions(frame_list=large)), ImageError, "large")
 
 
-def test_numbers_longer_than_python_reads(tmp_path: Path) -> None:
+def test_numbers_with_thousands_of_digits_are_accepted(tmp_path: Path) -> None:
     listing = tmp_path / "frames.txt"
     listing.write_text("1" * 5000 + "\n")
     check_frame_list(ImageOptions(frame_list=listing, image_name="%d.png"))
@@ -76,7 +76,7 @@ def test_numbers_longer_than_python_reads(tmp_path: Path) -> None:
         frames_of_images(names[1:], 7)
 
 
-def test_long_list_takes_no_square_of_its_length(tmp_path: Path) -> None:
+def test_long_list_is_checked_in_linear_time(tmp_path: Path) -> None:
     listing = tmp_path / "frames.txt"
     listing.write_text("".join(f"{i}\n" for i in range(100_000)))
     check_frame_list(ImageOptions(frame_list=listing))
@@ -150,7 +150,7 @@ HDF5 = {
 
 
 @pytest.mark.parametrize(("damage", "text"), HDF5.values(), ids=HDF5.keys())
-def test_hdf5_file(
+def test_damaged_hdf5_file_is_refused(
     tmp_path: Path, damage: Callable[[h5py.File, h5py.File], None], text: str
 ) -> None:
     paths = hloc_files(tmp_path, damage)
@@ -159,7 +159,7 @@ def test_hdf5_file(
 
 
 def test_compressed_hdf5_file_is_read(tmp_path: Path) -> None:
-    """Filters pack zeros to a thousandth: a file that declares so much holds it all the same."""
+    """Zeros compress by a factor of 1000, so a small file may contain large arrays."""
 
     def compress(features: h5py.File, _: h5py.File) -> None:
         del features["a/keypoints"]
@@ -170,7 +170,7 @@ def test_compressed_hdf5_file_is_read(tmp_path: Path) -> None:
 
 
 def model_files(counts: dict[str, int]) -> dict[str, bytes]:
-    """A model of an image and a point, with other counts where given."""
+    """A model of one image and one point, with the given counts in place of the true ones."""
 
     def count(name: str, kind: str = "<Q", honest: int = 1) -> bytes:
         return struct.pack(kind, counts.get(name, honest))
@@ -203,7 +203,7 @@ def model_files(counts: dict[str, int]) -> dict[str, bytes]:
     "field",
     ["cameras", "images", "keypoints", "points", "track", "rigs", "sensors", "frames", "data_ids"],
 )
-def test_model_that_declares_more_than_it_holds(tmp_path: Path, field: str, number: int) -> None:
+def test_model_with_too_large_counts_is_refused(tmp_path: Path, field: str, number: int) -> None:
     honest = model_files({})
     for name, data in honest.items():
         (tmp_path / name).write_bytes(data)
@@ -216,7 +216,7 @@ def test_model_that_declares_more_than_it_holds(tmp_path: Path, field: str, numb
     refused(lambda: read_model(tmp_path), ModelError, "cannot be read")
 
 
-def test_model_that_is_cut_off(tmp_path: Path) -> None:
+def test_truncated_model_is_refused(tmp_path: Path) -> None:
     for name, data in model_files({}).items():
         (tmp_path / name).write_bytes(data)
     for name, data in model_files({}).items():
@@ -231,14 +231,16 @@ def test_model_that_is_cut_off(tmp_path: Path) -> None:
     ("name", "text"),
     [(b"\xff.png", "UTF-8"), (b"../a.png", "outside"), (b"", "name")],
 )
-def test_model_with_a_name_of_no_file(tmp_path: Path, name: bytes, text: str) -> None:
+def test_model_with_an_invalid_image_name_is_refused(
+    tmp_path: Path, name: bytes, text: str
+) -> None:
     for file, data in model_files({}).items():
         (tmp_path / file).write_bytes(data.replace(b"a.png", name))
     refused(lambda: read_model(tmp_path), ModelError, text)
 
 
-def test_model_whose_numbers_are_none(tmp_path: Path) -> None:
-    # Places of the first parameter, and of the pose in both files that have it.
+def test_model_with_nan_is_refused(tmp_path: Path) -> None:
+    # Offsets of the first camera parameter, and of the pose in both files that contain it.
     for places, text in (
         ({"cameras.bin": 32}, "parameters"),
         ({"images.bin": 44, "frames.bin": 48}, "pose"),
@@ -252,7 +254,7 @@ def test_model_whose_numbers_are_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("side", [60_000, 20_000])
-def test_picture_of_many_pixels(tmp_path: Path, side: int) -> None:
+def test_picture_with_too_many_pixels_is_refused(tmp_path: Path, side: int) -> None:
     def chunk(kind: bytes, data: bytes) -> bytes:
         return (
             struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -281,8 +283,10 @@ sys.exit(main(["info", "--video", sys.argv[2]]))
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="limits address space as Linux does")
-def test_out_of_memory_is_one_line(encode: Encode, clip: Path, tmp_path: Path) -> None:
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="limits the address space, which works on Linux only"
+)
+def test_out_of_memory_gives_one_line(encode: Encode, clip: Path, tmp_path: Path) -> None:
     large = encode(make_frames(2, 3840, 2160), tmp_path / "large.mp4")
     words = [sys.executable, "-c", _WITH_LITTLE_MEMORY, str(clip), str(large)]
     run = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)

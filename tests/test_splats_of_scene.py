@@ -1,4 +1,4 @@
-"""Clouds for trainers of Gaussian splats, of the rendered clip with its exact surfaces."""
+"""Point clouds for splatting of the rendered clip, compared with its exact surfaces."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SPLATS = DensifyOptions(match=MatchOptions(images=ImageOptions(first_number=0)))
 
 @pytest.fixture(scope="module")
 def true_model(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The clip's poses, without points and without images on disk."""
+    """A model of the exact poses, without points and without image files."""
     folder = tmp_path_factory.mktemp("true")
     images = [
         ModelImage(i + 1, f"{frame:04d}.png", 7, truth.cam_from_world[frame])
@@ -51,7 +51,7 @@ def errors(model: pycolmap.Reconstruction) -> np.ndarray:
 
 
 def test_points_lie_on_the_surfaces(dense: Path) -> None:
-    """Those of tracks and of pictures, and those that fill holes, as shares of the distance."""
+    """Errors are relative to the distance, for observed points and for those that fill holes."""
     model = pycolmap.Reconstruction(dense)
     xyz = point_cloud(model)
     centres = np.array([model.images[i].projection_center() for i in sorted(model.images)])
@@ -62,13 +62,13 @@ def test_points_lie_on_the_surfaces(dense: Path) -> None:
     assert 20 < (~is_seen).sum() < 0.03 * len(xyz)
     assert np.median(off[is_seen]) < 0.005
     assert np.quantile(off[is_seen], 0.95) < 0.1
-    # What is left to fill is what pictures do not tell: few points, so few that are far off.
+    # Filled points have no measured depth: few points, and even fewer with large errors.
     assert np.median(off[~is_seen]) < 0.05
     assert (off[~is_seen] > 0.1).sum() < 0.003 * len(xyz)
 
 
-def test_no_point_is_nearer_than_the_nearest_surface(dense: Path, truth: Truth) -> None:
-    """Up to the noise of depths, in the pictures and around them."""
+def test_no_point_floats_in_front_of_the_nearest_surface(dense: Path, truth: Truth) -> None:
+    """Tested inside and around the images, with a tolerance for depth noise."""
     xyz = point_cloud(pycolmap.Reconstruction(dense))
     fx, fy, cx, cy = truth.camera.params
     for frame in FRAMES:
@@ -82,7 +82,7 @@ def test_no_point_is_nearer_than_the_nearest_surface(dense: Path, truth: Truth) 
         assert np.linalg.norm(xyz - centre, axis=1).min() > 0.97 * least
 
 
-def test_colours_and_observations_are_those_of_the_pictures(dense: Path) -> None:
+def test_colours_and_observations_match_the_pictures(dense: Path) -> None:
     model = pycolmap.Reconstruction(dense)
     pictures = {i: picture for i, picture in decode_frames(SCENE) if i in (0, 30)}
     for frame, picture in pictures.items():
@@ -100,15 +100,17 @@ def test_colours_and_observations_are_those_of_the_pictures(dense: Path) -> None
     assert min(p.track.length() for p in model.points3D.values()) >= 1
 
 
-def test_a_bound_on_the_number_of_points(true_model: Path, tmp_path: Path) -> None:
+def test_max_points_limits_the_cloud(true_model: Path, tmp_path: Path) -> None:
     bounded = replace(SPLATS, triangulate=TriangulateOptions(max_points=3000))
     report = densify(true_model, SCENE, tmp_path / "few", options=bounded)
     assert 2900 < report.num_points <= 3000
     assert report.coverage > 0.9
 
 
-def test_reconstruct_makes_splats_after_a_survey(made: ReconstructReport, tmp_path: Path) -> None:
-    """Only the points are made anew, and the survey comes back when it is asked for."""
+def test_reconstruct_changes_survey_points_to_splats(
+    made: ReconstructReport, tmp_path: Path
+) -> None:
+    """A resumed run only computes the points again, and can return to survey points."""
     output = tmp_path / "scene"
     shutil.copytree(made.output, output)
     options = replace(OPTIONS, triangulate=TriangulateOptions())

@@ -28,7 +28,7 @@ from colmap_av1.view import model as model_view
 
 @pytest.fixture(scope="session")
 def panning(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A clip whose upper half moves right by 3 pixels a frame, and whose lower half left."""
+    """A clip whose upper half moves right by 3 pixels per frame, and whose lower half left."""
     rng = np.random.default_rng(1)
     texture = cv2.resize(rng.integers(0, 256, (40, 160, 3), dtype=np.uint8), (640, 160))
     halves = [
@@ -39,7 +39,7 @@ def panning(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def hue_of(picture: np.ndarray) -> np.ndarray:
-    """Hues in degrees of the pixels that are not grey."""
+    """Hues in degrees of the coloured pixels."""
     hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV).reshape(-1, 3)
     return hsv[hsv[:, 1] > 60, 0] * 2.0
 
@@ -47,7 +47,7 @@ def hue_of(picture: np.ndarray) -> np.ndarray:
 def test_motion_is_coloured_by_direction(panning: Path, tmp_path: Path) -> None:
     output = tmp_path / "motion"
     options = ViewOptions(draw="motion")
-    # The encoder takes large blocks that refer to the first frame.
+    # The encoder uses large blocks that refer to the first frame.
     tracks = TrackOptions(max_block_area=None, max_uncoded_block_area=None, max_interval=None)
     assert view.view_video(panning, output, options=options, tracks=tracks) == 10
     names = sorted(p.name for p in output.iterdir())
@@ -57,24 +57,24 @@ def test_motion_is_coloured_by_direction(panning: Path, tmp_path: Path) -> None:
     upper, lower = hue_of(picture[64:144, 64:]), hue_of(picture[176:300, 64:])
     assert len(upper) > 1000
     assert len(lower) > 1000
-    # To the right is red, to the left its opposite.
+    # Red is motion to the right, the opposite hue to the left.
     assert np.median(np.minimum(upper, 360 - upper)) < 20
     assert abs(np.median(lower) - 180) < 20
 
 
-def test_tails_lead_to_where_tracks_were(panning: Path, tmp_path: Path) -> None:
+def test_tails_show_past_positions_of_tracks(panning: Path, tmp_path: Path) -> None:
     view.view_video(panning, tmp_path / "t", options=ViewOptions(draw="tracks", tail=6))
     first = cv2.imread(str(tmp_path / "t" / "frame_000000.png"))
     later = cv2.imread(str(tmp_path / "t" / "frame_000007.png"))
     plain = next(image for i, image in decode_frames(panning) if i == 7)
     changed = np.any(later != plain, axis=2)
-    # Tails of 6 frames at 3 pixels a frame.
+    # Tails of 6 frames at 3 pixels per frame.
     drawn = cv2.connectedComponentsWithStats(changed.astype(np.uint8))[2][1:]
     assert np.median(drawn[:, cv2.CC_STAT_WIDTH]) >= 15
     assert first.shape == later.shape
 
 
-def test_mp4_shows_both_and_is_the_same_each_time(panning: Path, tmp_path: Path) -> None:
+def test_mp4_shows_motion_and_tracks_and_is_reproducible(panning: Path, tmp_path: Path) -> None:
     for name in ("a.mp4", "b.mp4"):
         assert view.view_video(panning, tmp_path / name) == 10
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
@@ -84,12 +84,12 @@ def test_mp4_shows_both_and_is_the_same_each_time(panning: Path, tmp_path: Path)
     assert [(p.width, p.height) for p in pictures] == [(512, 320)] * 10
 
 
-def test_mp4_does_not_depend_on_what_lies_in_memory(clip: Path, tmp_path: Path) -> None:
+def test_mp4_does_not_depend_on_uninitialized_memory(clip: Path, tmp_path: Path) -> None:
     written = []
     for number in ("1", "165"):
         output = tmp_path / f"{number}.mp4"
         words = [*(sys.executable, "-m", "colmap_av1", "view", "--video", str(clip), "--quiet")]
-        # glibc fills memory that is given out with this number.
+        # glibc fills allocated memory with this number.
         environment = os.environ | {"MALLOC_PERTURB_": number}
         words += ["--output", str(output)]
         subprocess.run(words, check=True, env=environment, cwd=tmp_path)
@@ -98,7 +98,7 @@ def test_mp4_does_not_depend_on_what_lies_in_memory(clip: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("when", ["tracks", "pictures"])
-def test_video_that_changes(panning: Path, tmp_path: Path, when: str) -> None:
+def test_changed_video_is_refused(panning: Path, tmp_path: Path, when: str) -> None:
     video = tmp_path / "v.mp4"
     shutil.copyfile(panning, video)
 
@@ -123,7 +123,7 @@ def test_odd_sizes_are_padded(encode: Encode, tmp_path: Path) -> None:
     ("output", "message"),
     [("x.gif", r"\.mp4"), ("missing/x.mp4", "missing")],
 )
-def test_bad_outputs_leave_nothing(
+def test_invalid_outputs_are_refused_and_leave_nothing(
     panning: Path, tmp_path: Path, output: str, message: str
 ) -> None:
     with pytest.raises(OptionError, match=message):
@@ -131,7 +131,7 @@ def test_bad_outputs_leave_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_matches_join_their_keypoints(clip: Path, tmp_path: Path) -> None:
+def test_matches_are_drawn_between_their_keypoints(clip: Path, tmp_path: Path) -> None:
     options = MatchOptions(density=DensityOptions(preset="dense"))
     match(tmp_path / "a.db", clip, image_path=tmp_path / "frames", options=options)
     before = (tmp_path / "a.db").read_bytes()
@@ -142,7 +142,7 @@ def test_matches_join_their_keypoints(clip: Path, tmp_path: Path) -> None:
     output = str(tmp_path / "pair.png")
     assert main([*words, "--pair", *names, "--output", output]) == 0
     assert (tmp_path / "a.db").read_bytes() == before
-    # Wide pictures lie above each other: lines run from the one above to the one below.
+    # Wide pictures are stacked, and lines run from the upper to the lower one.
     lit = cv2.imread(output).any(axis=2)
     assert lit.shape == (256, 192)
     assert lit[120:136].any(axis=1).all()
@@ -152,7 +152,7 @@ def test_matches_join_their_keypoints(clip: Path, tmp_path: Path) -> None:
         xy = np.frombuffer(data, "<f4").reshape(-1, 2)
         near = np.zeros((128, 192), dtype=bool)
         near[np.floor(xy[:, 1]).astype(int), np.floor(xy[:, 0]).astype(int)] = True
-        # Dots are where keypoints are, and lines lead away from them.
+        # Dots are at the keypoints, and lines start there.
         assert (lit[top : top + 128] & near).sum() > 100
     swapped = view.view_database(tmp_path / "a.db", tmp_path / "frames", names[::-1])
     assert not np.array_equal(swapped.any(axis=2), lit)
@@ -165,7 +165,7 @@ def test_matches_join_their_keypoints(clip: Path, tmp_path: Path) -> None:
         (["frame_000000.png", "frame_000001.png"], "missing"),
     ],
 )
-def test_pairs_that_cannot_be_drawn(
+def test_invalid_pairs_are_refused(
     clip: Path, tmp_path: Path, pair: list[str], message: str
 ) -> None:
     match(tmp_path / "a.db", clip)
@@ -185,7 +185,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_model_shows_points_in_their_colours_and_the_path(model: Path, tmp_path: Path) -> None:
+def test_model_shows_coloured_points_and_the_camera_path(model: Path, tmp_path: Path) -> None:
     assert main(["view", "--model", str(model), "--output", str(tmp_path / "m.png")]) == 0
     picture = cv2.imread(str(tmp_path / "m.png"))
     assert picture.shape == (1200, 1600, 3)
@@ -199,7 +199,7 @@ def test_model_shows_points_in_their_colours_and_the_path(model: Path, tmp_path:
         assert np.count_nonzero(np.all(panel == model_view._PATH_COLOUR, axis=2)) > 50
 
 
-def test_model_in_the_browser(model: Path) -> None:
+def test_model_is_served_to_a_browser(model: Path) -> None:
     pytest.importorskip("viser")
     server = view.serve_model(model, port=18080)
     try:
@@ -211,7 +211,7 @@ def test_model_in_the_browser(model: Path) -> None:
         server.stop()
 
 
-def test_view_says_what_it_lacks(
+def test_view_names_missing_arguments(
     model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["view", "--model", str(model)]) == 2
@@ -227,7 +227,7 @@ def test_view_says_what_it_lacks(
 
 @pytest.mark.shared
 @pytest.mark.parametrize("read", [read_info, lambda video: view.view_video(video, "drawn.mp4")])
-def test_frames_that_are_too_large_are_refused_before_one_is_decoded(
+def test_too_large_frames_are_refused_before_decoding(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], object]
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""A wheel of the checkout, installed and used where there is no compiler."""
+"""A wheel of the checkout is installed and used without a compiler."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def test_wheel_holds_the_package_and_no_sources(wheel: Path) -> None:
+def test_wheel_contains_the_package_without_sources(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
     outside = [name for name in sizes if name.split("/")[0].partition("-")[0] != "colmap_av1"]
@@ -72,7 +72,7 @@ def test_wheel_matches_the_example_without_a_compiler(wheel: Path, tmp_path: Pat
         return done.stdout
 
     run(str(scripts / "pip"), "install", "--quiet", "--no-deps", "--no-index", str(wheel))
-    # The dependencies are those of this run; what the wheel installed comes before them.
+    # Use the dependencies of this run; packages installed with the wheel come first.
     packages = Path(
         run(str(scripts / "python"), "-c", "import site; print(site.getsitepackages()[0])").strip()
     )
