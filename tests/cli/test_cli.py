@@ -145,7 +145,7 @@ def test_invalid_input_gives_one_line_and_status_2(
     video = [] if "--video" in words else ["--video", "clip.mp4"]
     try:
         status: object = main(["match", "--database", "a.db", *video, *words])
-    except SystemExit as error:  # argparse's way out
+    except SystemExit as error:  # raised by argparse
         status = error.code
     out, err = capsys.readouterr()
     assert status == 2

@@ -352,7 +352,9 @@ def test_images_may_be_stored_without_rotation(
         np.testing.assert_allclose(ours, [192, 128] - theirs, atol=1e-4)
 
 
-def test_every_with_existing_images(clip: Path, cut: list[np.ndarray], tmp_path: Path) -> None:
+def test_every_applies_to_existing_images(
+    clip: Path, cut: list[np.ndarray], tmp_path: Path
+) -> None:
     folder = save(tmp_path / "step", cut[::3])
 
     def run(name: str, **images: Any) -> MatchReport:

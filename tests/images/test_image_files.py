@@ -120,7 +120,7 @@ def test_images_are_written(clip: Path, tmp_path: Path, ending: str) -> None:
     decoded = dict(decode_frames(clip))
     for frame, name in zip(frames, names, strict=True):
         image, truth = cv2.imread(str(tmp_path / "a/b" / name)), decoded[frame]
-        if ending == "jpg":  # which blurs colour
+        if ending == "jpg":  # JPEG subsamples colour
             image, truth = (cv2.cvtColor(i, cv2.COLOR_BGR2GRAY) for i in (image, truth))
         assert cv2.absdiff(image, truth).mean() <= (0 if ending == "png" else 4)
 

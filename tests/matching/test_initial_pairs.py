@@ -189,7 +189,7 @@ def test_pairs_with_few_inliers_are_demoted_if_no_pair_has_a_large_angle() -> No
     assert found[2] is geometries[2]
 
 
-def test_pairs_of_other_models_are_demoted() -> None:
+def test_mapper_starts_with_a_pair_of_the_first_model() -> None:
     """The mapper would try the pair with few inliers and a large angle first."""
     rng = np.random.default_rng(0)
     pairs = np.array([[0, 1], [2, 9]], dtype=np.int32)

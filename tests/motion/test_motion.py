@@ -93,7 +93,7 @@ def test_groups_are_read_by_several_threads(
 
     monkeypatch.setattr(reading, "_parse", note_thread)
     list(read_motion(clips["aom.mp4"], ReadOptions(num_threads=3)))
-    assert len(used) == 4  # one more reads the headers
+    assert len(used) == 4  # a further thread reads the headers
 
 
 def test_reader_waits_until_frames_are_used(

@@ -242,7 +242,7 @@ def test_numpy_numbers_and_paths_are_accepted() -> None:
     assert ImageOptions(frame_list=Path("a.txt")).frame_list == Path("a.txt")
 
 
-def test_camera_params_without_a_model_may_have_any_valid_length() -> None:
+def test_camera_params_without_a_model_may_be_for_non_square_pixels() -> None:
     assert CameraOptions(camera_params="500,320,240,0").camera_model is None
     assert CameraOptions(camera_params="500,400,320,240,0,0,0,0").camera_model is None
 

@@ -80,9 +80,9 @@ def cameras(rng: np.random.Generator) -> list[PosedCamera]:
 
 
 def made(velocity: tuple[float, float, float] | None, *, drift: float = 0.0) -> Made:
-    """Tracks of a wall, a box before it and, with a velocity in metres an image, a walker.
+    """Tracks of a wall, a box in front of it and, with a velocity in metres per image, a walker.
 
-    Each point is seen where nothing nearer hides it; a part of the tracks drifts.
+    Points are observed where they are not occluded; a share `drift` of the tracks drifts.
     """
     rng = np.random.default_rng(3)
     views = cameras(rng)
@@ -99,7 +99,7 @@ def made(velocity: tuple[float, float, float] | None, *, drift: float = 0.0) -> 
     speed = np.array(velocity if velocity is not None else (0, 0, 0))
     found: list[list[tuple[int, float, float]]] = [[] for _ in range(len(still) + len(walker))]
     for number, view in enumerate(views):
-        # Nobody walks as steadily as a camera on rails: steps alone tell that it is no point.
+        # With a constant velocity the tracks could be those of static points at another depth.
         there = start + speed * (number + 3 * np.sin(number / 2))
         xyz = np.concatenate([still, walker + there])
         index, xy, depth = view.project(xyz)
@@ -327,7 +327,7 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
         cameras={7: truth.camera},
         masks=(None,) * NUM_FRAMES,
     )
-    inputs: Any = None  # for stages before
+    inputs: Any = None  # only used by earlier stages
     folder = tmp_path_factory.mktemp("passed")
     shown = (ShownVideo.as_played(video),)
     run = Run(

@@ -164,7 +164,7 @@ def test_adjustment_straightens_a_bent_end(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="file sizes cannot be limited there")
-def test_full_disk(made: ReconstructReport, tmp_path: Path) -> None:
+def test_full_disk_is_reported(made: ReconstructReport, tmp_path: Path) -> None:
     """COLMAP reports no error when it cannot write a model."""
     import resource  # noqa: PLC0415 - not available on Windows
 

@@ -88,7 +88,7 @@ def test_similarity_transforms_poses_like_points() -> None:
 
 def test_east_north_up_is_tangent_to_the_ellipsoid() -> None:
     origin = (59.33, 18.07, 20.0)
-    # A minute of latitude is a sea mile, one of longitude half as long there.
+    # A minute of latitude is a nautical mile; a minute of longitude is half as long there.
     there = np.array([[59.33 + 1 / 60, 18.07, 20], [59.33, 18.07 + 1 / 60, 21]])
     east, north, up = east_north_up(there, origin).T
     assert north[0] == pytest.approx(1857, abs=2)
