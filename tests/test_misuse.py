@@ -56,7 +56,7 @@ def test_arrays_of_wrong_shape_are_refused() -> None:
                 build_tracks([dataclasses.replace(frame, **{field: wrong})])
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs the processes of a Unix")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs the processes of a Unix system")
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.parametrize("num_threads", [1, 4])
 def test_fork_while_reading_is_an_error_in_the_child(num_threads: int) -> None:

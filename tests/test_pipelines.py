@@ -25,7 +25,7 @@ FEW = ("--preset", "sparse", "--max_tracks_per_image", "500")
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(shutil.which("colmap") is None, reason="no colmap command on PATH"),
-    pytest.mark.skipif(os.name == "nt", reason="the scripts need a shell of Unix"),
+    pytest.mark.skipif(os.name == "nt", reason="the scripts need a Unix shell"),
 ]
 
 

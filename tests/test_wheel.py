@@ -17,7 +17,7 @@ from colmap_av1.database.reading import read_images
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(sys.platform == "win32", reason="looks for the programs of a Unix"),
+    pytest.mark.skipif(sys.platform == "win32", reason="needs the programs of a Unix system"),
 ]
 
 
@@ -29,7 +29,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
         [*build, str(PROJECT)], cwd=folder, capture_output=True, text=True, check=False
     )
     if "No matching distribution found for scikit-build-core" in run.stderr:
-        pytest.skip("the build's requirements cannot be fetched")
+        pytest.skip("the build requirements cannot be downloaded")
     assert run.returncode == 0, run.stderr
     (made,) = folder.glob("*.whl")
     return made

@@ -248,7 +248,7 @@ def test_control_characters_in_names_are_escaped(
     assert len(printed.err.splitlines()) == printed.err.count("colmap-av1: ")
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes are closed differently there")
 def test_closed_output_ends_the_command(clip: Path, tmp_path: Path) -> None:
     words = [sys.executable, "-m", "colmap_av1", "info", "--video", str(clip)]
     with subprocess.Popen(

@@ -173,7 +173,7 @@ def test_models_are_only_replaced_with_overwrite(
     assert contents(work) == before
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such file locks")
 @pytest.mark.parametrize("steps", range(0, 9, 2))
 def test_half_replaced_model_is_restored_by_a_failing_run(steps: int, work: Path) -> None:
     before = contents(work / "model")

@@ -23,7 +23,7 @@ from colmap_av1.video.container import open_stream
 from colmap_av1.video.encode import stream_of
 
 LAYERS = PROJECT / "tests" / "data" / "conformance" / "svc_L2T1.ivf"
-posix = pytest.mark.skipif(os.name != "posix", reason="there are no such files or users")
+posix = pytest.mark.skipif(os.name != "posix", reason="Windows has no such files or users")
 
 
 def error_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:

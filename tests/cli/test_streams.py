@@ -12,7 +12,9 @@ import pytest
 
 from colmap_av1.motion.motion_file import export_motion
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other shells and devices there")
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="shells and devices are different there"
+)
 
 # Exit status and number of error lines.
 CASES = {

@@ -150,7 +150,7 @@ def test_missing_packages_and_gpu_are_reported(
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(TORCH_PYTHON is None, reason="COLMAP_AV1_TORCH_PYTHON names no Python")
+@pytest.mark.skipif(TORCH_PYTHON is None, reason="COLMAP_AV1_TORCH_PYTHON is not set")
 def test_training_on_cpu(
     scene: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

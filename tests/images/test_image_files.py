@@ -135,7 +135,7 @@ def test_existing_images_are_kept(clip: Path, tmp_path: Path) -> None:
     assert (tmp_path / "sub/x.png").exists()
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not allow such names")
 @pytest.mark.parametrize("locale", ["C", "C.UTF-8"])
 @pytest.mark.parametrize("name", [b"loc\xe9", "locé".encode()])
 def test_paths_need_not_be_utf_8(tmp_path: Path, name: bytes, locale: str) -> None:
@@ -157,7 +157,7 @@ sys.stdout.buffer.write(bytes([*image_size(path)]) + read_image(path).tobytes())
     assert done.stdout == bytes([8, 8]) + picture.tobytes()
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes of a Unix")
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs the pipes of a Unix system")
 def test_pipes_are_refused_as_images(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.png")
     for read in (image_size, read_image):

@@ -159,7 +159,9 @@ print(len(parser.take_events()))
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="limits address space as Linux does")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="limits the address space, which works on Linux only"
+)
 def test_tiles_are_read_without_threads_if_none_can_be_started(tmp_path: Path) -> None:
     video = tmp_path / "tiles.obu"
     ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "lavfi", "-i", SOURCE]

@@ -23,7 +23,7 @@ from colmap_av1.util.files import (
 )
 from colmap_av1.util.stages import open_stages
 
-locks = pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
+locks = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such file locks")
 
 
 def names_in(folder: Path) -> list[str]:

@@ -38,7 +38,7 @@ def test_hdf5_groups_and_datasets_are_written(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="files have no limits there")
+@pytest.mark.skipif(sys.platform == "win32", reason="file sizes cannot be limited there")
 @pytest.mark.parametrize("size", [2, 50, 5000, 100_000])
 def test_full_disk_is_reported(size: int, tmp_path: Path) -> None:
     command = [sys.executable, "-c", FILL_THE_DISK, str(tmp_path / "a"), str(size)]

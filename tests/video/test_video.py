@@ -197,7 +197,9 @@ def test_recordings_truncated_in_the_last_packet_are_reported(
         list(read_motion(cut, ReadOptions(strict=True)))
 
 
-@pytest.mark.skipif(not hasattr(av.Packet, "has_sidedata"), reason="PyAV shows no encryption")
+@pytest.mark.skipif(
+    not hasattr(av.Packet, "has_sidedata"), reason="PyAV does not report encryption"
+)
 @pytest.mark.parametrize("codec", [AV1, ["-c:v", "libx264"]])
 def test_encrypted_videos_are_reported_as_encrypted(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, codec: list[str]
