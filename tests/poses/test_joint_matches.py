@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from conftest import QUICK_AV1, Encode
 from databases import keypoints_of
 from dense_scene import SCENE, Truth
 from numpy.typing import NDArray
@@ -36,6 +36,8 @@ from colmap_av1.options import (
 from colmap_av1.poses.starting_pair import starting_pair
 from colmap_av1.video.decoding import decode_frames
 
+# Of the pictures, as a share of those of the rendered clip.
+SIZE = 0.75
 EVERY = 5
 OPTIONS = MatchOptions(images=ImageOptions(every=EVERY))
 
@@ -64,20 +66,27 @@ def num_keypoints(database: Path) -> dict[str, int]:
 
 
 @pytest.fixture(scope="module")
-def joint(tmp_path_factory: pytest.TempPathFactory) -> MatchReport:
+def scene(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The rendered clip in smaller pictures."""
+    pictures = np.stack([smaller(picture, SIZE) for _, picture in decode_frames(SCENE)])
+    return encode(pictures, tmp_path_factory.mktemp("scene") / "scene.mp4", *QUICK_AV1)
+
+
+@pytest.fixture(scope="module")
+def joint(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> MatchReport:
     folder = tmp_path_factory.mktemp("joint")
-    return match(folder / "a.db", SCENE, image_path=folder / "images", options=OPTIONS)
+    return match(folder / "a.db", scene, image_path=folder / "images", options=OPTIONS)
 
 
 def test_a_mapper_gets_fewer_keypoints_and_ends_nearer_to_the_truth(
-    joint: MatchReport, truth: Truth, tmp_path: Path
+    joint: MatchReport, scene: Path, truth: Truth, tmp_path: Path
 ) -> None:
     images = joint.image_path
     assert images is not None
     assert joint.estimate is not None
     assert joint.estimate.num_registered == (joint.num_images,)
     assert joint.warnings == ()
-    other = match(tmp_path / "b.db", SCENE, image_path=images, options=by_pairs(OPTIONS))
+    other = match(tmp_path / "b.db", scene, image_path=images, options=by_pairs(OPTIONS))
     assert other.estimate is None
     assert joint.num_observations < 0.6 * other.num_observations
     errors = []
@@ -91,7 +100,7 @@ def test_a_mapper_gets_fewer_keypoints_and_ends_nearer_to_the_truth(
 
 
 def test_the_camera_is_that_of_the_estimate(joint: MatchReport, truth: Truth) -> None:
-    assert joint.focal_length == pytest.approx(truth.camera.focal_length_x, rel=0.005)
+    assert joint.focal_length == pytest.approx(truth.camera.focal_length_x * SIZE, rel=0.005)
     (camera,) = read_cameras(joint.database).values()
     assert camera.has_prior_focal_length
     assert camera.focal_length_x == pytest.approx(joint.focal_length)
@@ -105,20 +114,20 @@ def test_no_track_has_two_keypoints_in_an_image(joint: MatchReport) -> None:
             assert near[:, 1].min() > 0.01
 
 
-def test_pairs_that_are_asked_for(joint: MatchReport, tmp_path: Path) -> None:
+def test_pairs_that_are_asked_for(joint: MatchReport, scene: Path, tmp_path: Path) -> None:
     """A joint estimate chooses the pairs itself."""
     images, asked = joint.image_path, PairOptions(offsets=(1, 2), growth=1)
     report = match(
-        tmp_path / "a.db", SCENE, image_path=images, options=replace(OPTIONS, pairs=asked)
+        tmp_path / "a.db", scene, image_path=images, options=replace(OPTIONS, pairs=asked)
     )
     assert report.estimate is None
     assert report.num_pairs == 2 * joint.num_images - 3
     options = replace(OPTIONS, pairs=asked, verify=VerifyOptions(verify="joint"))
     with pytest.raises(OptionError, match="offsets"):
-        match(tmp_path / "b.db", SCENE, image_path=images, options=options)
+        match(tmp_path / "b.db", scene, image_path=images, options=options)
 
 
-def test_a_failed_estimate_that_is_asked_for(tmp_path: Path) -> None:
+def test_a_failed_estimate_that_is_asked_for(scene: Path, tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_text("0\n4\n")
     options = MatchOptions(
         images=ImageOptions(frame_list=str(tmp_path / "list.txt")),
@@ -126,13 +135,13 @@ def test_a_failed_estimate_that_is_asked_for(tmp_path: Path) -> None:
         verify=VerifyOptions(verify="joint"),
     )
     with pytest.raises((ModelError, VideoError)):
-        match(tmp_path / "a.db", SCENE, options=options)
+        match(tmp_path / "a.db", scene, options=options)
     assert not (tmp_path / "a.db").exists()
 
 
-def test_the_same_database_again(joint: MatchReport, tmp_path: Path) -> None:
+def test_the_same_database_again(joint: MatchReport, scene: Path, tmp_path: Path) -> None:
     one = replace(OPTIONS, run=RunOptions(num_threads=1))
-    match(tmp_path / "a.db", SCENE, image_path=joint.image_path, options=one)
+    match(tmp_path / "a.db", scene, image_path=joint.image_path, options=one)
     dumps = []
     for path in (joint.database, tmp_path / "a.db"):
         with sqlite3.connect(path) as connection:
@@ -140,45 +149,51 @@ def test_the_same_database_again(joint: MatchReport, tmp_path: Path) -> None:
     assert dumps[0] == dumps[1]
 
 
-def test_images_of_half_the_size(joint: MatchReport, truth: Truth, tmp_path: Path) -> None:
+def test_images_of_half_the_size(
+    joint: MatchReport, scene: Path, truth: Truth, tmp_path: Path
+) -> None:
     assert joint.image_path is not None
     halves = tmp_path / "halves"
     halves.mkdir()
     for path in joint.image_path.iterdir():
         picture = cv2.imread(str(path))
         cv2.imwrite(str(halves / f"half_{path.name}"), smaller(picture, 0.5))
-    report = match(tmp_path / "a.db", SCENE, image_path=halves, options=OPTIONS)
+    report = match(tmp_path / "a.db", scene, image_path=halves, options=OPTIONS)
     assert report.estimate is not None
     assert report.estimate.num_registered == (joint.num_images,)
-    assert report.focal_length == pytest.approx(truth.camera.focal_length_x / 2, rel=0.01)
+    assert report.focal_length == pytest.approx(truth.camera.focal_length_x * SIZE / 2, rel=0.01)
 
 
-def test_too_few_images_for_an_estimate(tmp_path: Path) -> None:
+def test_too_few_images_for_an_estimate(scene: Path, tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_text("0\n4\n")
     options = MatchOptions(
         images=ImageOptions(frame_list=str(tmp_path / "list.txt")),
         density=DensityOptions(min_images=2),
     )
-    report = match(tmp_path / "a.db", SCENE, image_path=tmp_path / "images", options=options)
+    report = match(tmp_path / "a.db", scene, image_path=tmp_path / "images", options=options)
     assert report.estimate is None
     assert any("joint estimate" in warning for warning in report.warnings)
-    match(tmp_path / "b.db", SCENE, options=by_pairs(options))
+    match(tmp_path / "b.db", scene, options=by_pairs(options))
     assert num_keypoints(tmp_path / "a.db") == num_keypoints(tmp_path / "b.db")
 
 
-def test_a_camera_for_each_image(joint: MatchReport, tmp_path: Path) -> None:
+def test_a_camera_for_each_image(joint: MatchReport, scene: Path, tmp_path: Path) -> None:
     assert joint.image_path is not None
+    few = tmp_path / "few"
+    few.mkdir()
+    for path in sorted(joint.image_path.iterdir())[:4]:
+        shutil.copy(path, few)
     database = tmp_path / "listed.db"
     with pycolmap.Database.open(database):  # makes the file
         pass
-    pycolmap.import_images(database, joint.image_path, pycolmap.CameraMode.PER_IMAGE)
-    report = match(database, SCENE, image_path=joint.image_path)
+    pycolmap.import_images(database, few, pycolmap.CameraMode.PER_IMAGE)
+    report = match(database, scene, image_path=few)
     assert report.estimate is None
     assert any("several cameras" in warning for warning in report.warnings)
     options = replace(OPTIONS, verify=VerifyOptions(verify="joint"))
     options = replace(options, camera=CameraOptions(single_camera=False))
     with pytest.raises(OptionError, match="single_camera"):
-        match(tmp_path / "new.db", SCENE, image_path=joint.image_path, options=options)
+        match(tmp_path / "new.db", scene, image_path=joint.image_path, options=options)
 
 
 def test_nothing_is_left_beside_the_database(joint: MatchReport) -> None:
@@ -187,12 +202,16 @@ def test_nothing_is_left_beside_the_database(joint: MatchReport) -> None:
 
 
 @pytest.mark.parametrize("count", [13, 8])
-def test_two_scenes(count: int, encode: Callable[..., Path], tmp_path: Path) -> None:
+def test_two_scenes(count: int, encode: Encode, tmp_path: Path) -> None:
     """An estimate has a model of each scene, the larger first; one of few images has none."""
     pictures = [smaller(picture, 0.75) for _, picture in decode_frames(SCENE)]
     videos = [
-        encode(np.stack([p[:, ::-1] for p in pictures[40 : 40 + count]]), tmp_path / "one.mp4"),
-        encode(np.stack(pictures[:18]), tmp_path / "two.mp4"),
+        encode(
+            np.stack([p[:, ::-1] for p in pictures[40 : 40 + count]]),
+            tmp_path / "one.mp4",
+            *QUICK_AV1,
+        ),
+        encode(np.stack(pictures[:18]), tmp_path / "two.mp4", *QUICK_AV1),
     ]
     options = MatchOptions(
         links=LinkOptions(links="none"), camera=CameraOptions(single_camera=True)
