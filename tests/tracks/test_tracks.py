@@ -946,7 +946,7 @@ def test_kept_frames_are_renumbered() -> None:
 
 def test_progress_counts_coded_frames() -> None:
     seen: list[int] = []
-    build_tracks(low_delay([(0.0, 0.0)] * 3), progress=seen.append)
+    build_tracks(low_delay([(0.0, 0.0)] * 3), progress=lambda _, number, total: seen.append(number))
     assert seen == [1, 2, 3, 4]
 
 
