@@ -78,6 +78,8 @@ _SAME_TRACK = 0.01
 # and 7 %. With the adjusted focal length, COLMAP's mapper registers all images of the drive; with
 # the initial guess, 5 of 51.
 _FOCAL_LENGTH_ERROR = 0.03
+# If a larger share of the images is not registered, the estimate has failed.
+_MAX_LEFT = 0.5
 # Largest number of matches of the initial pair.
 _MAX_INITIAL_MATCHES = 300
 
@@ -135,7 +137,8 @@ def match_jointly(
         density: which motion tracks are matched.
 
     Raises:
-        ModelError: the poses cannot be estimated, or the long-range check contradicts them.
+        ModelError: the poses of most images cannot be estimated, or the long-range check
+            contradicts them.
         VideoError: nothing connects any two images.
     """
     if density.max_sigma is None:
@@ -150,6 +153,12 @@ def match_jointly(
     models.sort(key=lambda model: -len(model.placed.images))
     registered = {image.name for model in models for image in model.placed.images}
     left = [name for name in image_set.images.names if name not in registered]
+    num_images = len(image_set.sequence)
+    if len(left) > _MAX_LEFT * num_images:
+        raise ModelError(
+            f"the joint estimate registers only {num_images - len(left)} of {num_images} images: "
+            "match them pair by pair with --verify pairs"
+        )
     with run.clock.measure("pairs"):
         others = tracks_of_unregistered(run, posed, image_set, left, density)
         model_of = models_of_images(others, [model.placed.frames for model in models], image_set)
