@@ -180,8 +180,8 @@ def adjust_model(
         max_steps: largest number of iterations of each adjustment.
         tolerance: function tolerance of the last adjustment: smallest relative decrease of the cost
             per iteration.
-        iterative: solve the linear systems by conjugate gradients, whose time grows with the number
-            of observations only. If the scale is poorly determined they take longer.
+        iterative: solve the linear systems by conjugate gradients. They are faster for many images,
+            and slower if the scale is poorly determined.
 
     Raises:
         ModelError: the adjustment failed; the log holds the details.

@@ -165,7 +165,7 @@ def test_contradicting_matches_are_left_out(tmp_path):
 
 @pytest.fixture(scope="module")
 def scene_footage(ffmpeg, tmp_path_factory):
-    """Of the rendered clip at three quarters of its size."""
+    """Footage of the rendered clip at three quarters of its size."""
     folder = tmp_path_factory.mktemp("scene")
     words = ["-vf", "scale=480:270:flags=area", "-pix_fmt", "yuv420p", *AV1]
     video = tmp_path_factory.mktemp("smaller") / "smaller.mp4"

@@ -64,7 +64,7 @@ def test_container_focal_length_is_used_if_motion_gives_none(
     )
     report = match(tmp_path / "a.db", tagged)
     assert report.focal_length is None  # none from the tracks
-    assert any("container" in words for words in report.warnings)
+    assert any("container" in warning for warning in report.warnings)
     (camera,) = read_cameras(tmp_path / "a.db").values()
     assert camera.mean_focal_length() == pytest.approx(30 / 43.267 * 230.76, abs=0.1)
     assert camera.has_prior_focal_length
@@ -72,6 +72,6 @@ def test_container_focal_length_is_used_if_motion_gives_none(
         camera=CameraOptions(camera_model="SIMPLE_PINHOLE", camera_params="200,96,64")
     )
     report = match(tmp_path / "b.db", tagged, options=options)
-    assert not any("container" in words for words in report.warnings)
+    assert not any("container" in warning for warning in report.warnings)
     (camera,) = read_cameras(tmp_path / "b.db").values()
     assert camera.mean_focal_length() == 200

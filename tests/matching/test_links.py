@@ -78,7 +78,7 @@ def jerk(
 def far_jerk(
     halved: NDArray[np.uint8], encode: Encode, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """The rendered clip without more frames."""
+    """The rendered clip without a longer part of its middle."""
     return encode(_without(halved, FAR_OUT), tmp_path_factory.mktemp("far") / "jerk.mp4")
 
 

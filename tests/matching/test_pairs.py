@@ -6,23 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from image_sets import tracks_from
 from synthetic_scene import make_scene
 
 from colmap_av1.errors import ImageError
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.options import PairOptions
-from colmap_av1.tracks.tracks import Tracks
-
-
-def tracks_from(spans: list[list[int]], num_frames: int = 10) -> Tracks:
-    """Track t is observed in the frames spans[t], at (100 t + frame, t)."""
-    frame = np.array([f for span in spans for f in span], dtype=np.int32)
-    track = np.repeat(np.arange(len(spans)), [len(s) for s in spans])
-    offsets = np.concatenate([[0], np.cumsum([len(s) for s in spans])]).astype(np.int64)
-    xy = np.stack([100 * track + frame, track], axis=1).astype(np.float32).reshape(-1, 2)
-    sigma = np.zeros(len(frame), np.float32)
-    confirmed = np.zeros(len(frame), bool)
-    return Tracks(num_frames, 640, 480, offsets, frame, xy, sigma, confirmed)
 
 
 def images_seeing(tracks_of_image: list[list[int]]) -> list[ImageKeypoints]:

@@ -36,7 +36,7 @@ from colmap_av1.options import (
 from colmap_av1.poses.starting_pair import starting_pair
 from colmap_av1.video.decoding import decode_frames
 
-# Of the pictures, as a share of those of the rendered clip.
+# The pictures of the rendered clip are scaled by this factor.
 SIZE = 0.75
 EVERY = 5
 OPTIONS = MatchOptions(images=ImageOptions(every=EVERY))

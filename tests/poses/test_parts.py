@@ -7,24 +7,15 @@ from pathlib import Path
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pytest
 import walks
+from image_sets import images
 from sequences import model_poses
 
 from colmap_av1.evaluate import pose_errors
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, read_model
 from colmap_av1.geometry.posed_model import PosedModel
-from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.image_set import ImageSet, count_through
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.parts import parts_of
 from colmap_av1.reconstruct import reconstruct
-
-
-def images(*counts: int) -> ImageSet:
-    """Images of videos named a, b and so on."""
-    chosen = [
-        ChosenImages([f"{k:03}.png" for k in range(count)], np.arange(count, dtype=np.int32))
-        for count in counts
-    ]
-    return count_through("abcd"[: len(counts)], chosen, counts)
 
 
 def model(image_set: ImageSet, views: list[list[int]]) -> PosedModel:

@@ -3,36 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from image_sets import images, tracks_from
 
-from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.image_set import ImageSet, count_through
 from colmap_av1.poses.unregistered import models_of_images, within_models
 from colmap_av1.tracks.tracks import Tracks
-
-
-def images(*counts: int) -> ImageSet:
-    """All frames of videos named a, b and so on."""
-    chosen = [
-        ChosenImages([f"{k:03}.png" for k in range(count)], np.arange(count, dtype=np.int32))
-        for count in counts
-    ]
-    return count_through("abcd"[: len(counts)], chosen, counts)
-
-
-def tracks_in(*seen: list[int], num_frames: int) -> Tracks:
-    """A track for each list of frames."""
-    lengths = [len(own) for own in seen]
-    frame = np.concatenate(seen).astype(np.int32)
-    return Tracks(
-        num_frames=num_frames,
-        width=64,
-        height=48,
-        offsets=np.cumsum([0, *lengths]).astype(np.int64),
-        frame=frame,
-        xy=np.zeros((len(frame), 2), np.float32),
-        sigma=np.ones(len(frame), np.float32),
-        confirmed=np.ones(len(frame), np.bool_),
-    )
 
 
 def frames(*index: int) -> np.ndarray:
@@ -57,7 +31,7 @@ def test_long_unregistered_stretches_join_no_model() -> None:
 
 def test_unregistered_video_joins_the_model_that_shares_its_tracks() -> None:
     image_set = images(4, 4, 6)
-    tracks = tracks_in([3, 9], [5, 9, 10], [6, 11, 12], num_frames=14)
+    tracks = tracks_from([[3, 9], [5, 9, 10], [6, 11, 12]], num_frames=14)
     of_images = models_of_images(tracks, [frames(0, 1, 2, 3), frames(4, 5, 6, 7)], image_set)
     assert of_images.tolist() == [0] * 4 + [1] * 10
 
@@ -66,7 +40,7 @@ def test_tracks_are_split_between_models() -> None:
     image_set = images(16)
     left = [image_set.images.names[i] for i in (2, *range(6, 10))]
     of_images = np.array([0] * 6 + [-1] * 4 + [1] * 6)
-    tracks = tracks_in([1, 2, 3, 7, 12], [4, 5, 6], [7, 8, 9], num_frames=16)
+    tracks = tracks_from([[1, 2, 3, 7, 12], [4, 5, 6], [7, 8, 9]], num_frames=16)
     parts = within_models(tracks, left, of_images, image_set)
     # The rest of the first track, in the second model, observes no unregistered image.
     assert parts.frame.tolist() == [1, 2, 3]
