@@ -31,6 +31,7 @@ from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.initial_adjustment import KnownPoses
 from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
 from colmap_av1.matching.links import LinkReport
+from colmap_av1.matching.mapper_limits import FORWARD_MOTION_OPTIONS
 from colmap_av1.matching.match_images import (
     ImageMatches,
     ImageMatchOptions,
@@ -147,7 +148,11 @@ class MatchReport:
         ]
         if self.forward_motion:
             mapper += [
-                "--Mapper.init_max_forward_motion", "1",
+                *(
+                    word
+                    for name, value in FORWARD_MOTION_OPTIONS.items()
+                    for word in (f"--Mapper.{name}", f"{value:g}")
+                ),
                 "--Mapper.ba_refine_focal_length", "0",
                 "--Mapper.ba_refine_extra_params", "0",
             ]

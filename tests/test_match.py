@@ -493,6 +493,7 @@ def test_forward_motion_is_noticed(
     report = match(tmp_path / "a.db", drive, options=MatchOptions(camera=street))
     assert report.forward_motion
     assert "--Mapper.init_max_forward_motion 1" in report.next_commands[0]
+    assert "--Mapper.init_min_tri_angle 4" in report.next_commands[0]
     assert "--forward_motion" in report.next_commands[1]
 
     aside = CameraOptions("PINHOLE", "200,200,96,64")

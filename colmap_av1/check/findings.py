@@ -17,6 +17,7 @@ from colmap_av1.geometry.cameras import camera_fault, focal_length_warning
 from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.gaps import Gap, few_matches_warning
 from colmap_av1.matching.mapper_limits import (
+    FORWARD_MOTION_OPTIONS,
     INITIAL_LEAST_ANGLE,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
@@ -325,7 +326,8 @@ def motion_findings(
         yield Finding(
             "warning",
             "the camera moves along its axis: the incremental mapper starts only with "
-            "--Mapper.init_max_forward_motion 1, and the focal length is not observable",
+            f"{' '.join(f'--Mapper.{k} {v:g}' for k, v in FORWARD_MOTION_OPTIONS.items())}, and "
+            "the focal length is not observable",
         )
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.mapper_limits import (
+    FORWARD_MOTION_OPTIONS,
     INITIAL_MAX_FORWARD_MOTION,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
@@ -27,12 +28,6 @@ _Floats = NDArray[np.float64]
 # a time, and takes the first it finds; if it finds none, it goes on to the other images. Here, at
 # least the first number of images and at most the second are tried.
 _NUM_FIRST_IMAGES, _MAX_IMAGES = 16, 100
-# The mapper's limits of inliers and angle. The next ones are tried if no pair meets the first ones.
-_LIMITS = (
-    (INITIAL_MIN_INLIERS, INITIAL_MIN_ANGLE),
-    (INITIAL_MIN_INLIERS // 2, INITIAL_MIN_ANGLE),
-    (INITIAL_MIN_INLIERS // 2, INITIAL_MIN_ANGLE / 2),
-)
 # The mapper estimates a pair's pose anew by RANSAC: fewest trials, and largest error in pixels.
 _NUM_TRIALS, _MAX_ERROR = 30, 4.0
 # Neighbours are at most this many images apart.
@@ -61,6 +56,40 @@ _NUM_ADJUSTED = 200
 # The mapper adjusts few images up to five times, with 100 iterations and this gradient tolerance.
 # Some intrinsics diverge slowly.
 _NUM_ITERATIONS, _GRADIENT_TOLERANCE = 500, 0.1
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """The mapper's limits for an initial pair.
+
+    Attributes:
+        min_inliers: fewest inliers.
+        min_angle: smallest triangulation angle in degrees.
+        max_forward_motion: largest share of the translation along the optical axis.
+    """
+
+    min_inliers: int
+    min_angle: float
+    max_forward_motion: float
+
+    def allow(self, pose: _Floats, angle: float, margin: float) -> bool:
+        """Whether a pose meets the limits of angle and forward motion, within a margin."""
+        forward_margin = _FORWARD_MARGIN if margin < 1 else -_FORWARD_MARGIN
+        is_aside = abs(pose[2, 3]) <= self.max_forward_motion + forward_margin
+        return bool(angle >= margin * self.min_angle) and (is_aside or self.max_forward_motion >= 1)
+
+
+def _limits(matched: MatchedImages) -> tuple[_Limits, ...]:
+    """The mapper's limits; the next ones are tried if no pair meets the first ones."""
+    first = _Limits(INITIAL_MIN_INLIERS, INITIAL_MIN_ANGLE, INITIAL_MAX_FORWARD_MOTION)
+    if matched.forward_motion:
+        first = _Limits(
+            INITIAL_MIN_INLIERS,
+            FORWARD_MOTION_OPTIONS["init_min_tri_angle"],
+            FORWARD_MOTION_OPTIONS["init_max_forward_motion"],
+        )
+    fewer = replace(first, min_inliers=first.min_inliers // 2)
+    return first, fewer, replace(fewer, min_angle=fewer.min_angle / 2)
 
 
 @dataclass(frozen=True)
@@ -233,12 +262,13 @@ def bad_initial_pairs(
     """
     counts = np.array([len(own.inlier_matches) for own in matched.geometries], dtype=np.intp)
     bad, sure = set[int](), set[int]()
-    for limits in _LIMITS:
+    every = _limits(matched)
+    for limits in every:
         # Pairs that the mapper rejects keep their inliers, however wrong their pose is.
         bad |= {
             k
             for k, angle in misleading.items()
-            if counts[k] >= limits[0] and angle >= _WIDE_SHARE * limits[1]
+            if counts[k] >= limits.min_inliers and angle >= _WIDE_SHARE * limits.min_angle
         }
         starts = _starts(matched, cameras, known, limits=limits, left_out=bad)
         if known.are_comparable or any(start.is_stable for start in starts.values()):
@@ -250,7 +280,7 @@ def bad_initial_pairs(
         }
         if sure:
             break
-    if known.are_comparable and limits != _LIMITS[0]:
+    if known.are_comparable and limits != every[0]:
         # The mapper tries hundreds of pairs with few inliers, and RANSAC may give any of them a
         # wrong pose with a large angle. Neighbours keep their inliers, which connect them.
         apart = np.diff(matched.pairs.reshape(-1, 2), axis=1)[:, 0] > _NEIGHBOURS
@@ -264,7 +294,7 @@ def _starts(
     cameras: Sequence[pycolmap.Camera],
     known: KnownPoses,
     *,
-    limits: tuple[int, float],
+    limits: _Limits,
     left_out: Container[int],
 ) -> dict[int, _Start]:
     """Begin models with pairs in the mapper's order, until it would certainly have begun one.
@@ -274,7 +304,7 @@ def _starts(
     """
     starts: dict[int, _Start | None] = {}
     is_sure = False
-    for num_looked, of_image in enumerate(_in_order(matched, cameras, limits[0])):
+    for num_looked, of_image in enumerate(_in_order(matched, cameras, limits.min_inliers)):
         if num_looked >= _NUM_FIRST_IMAGES and is_sure:
             break
         for k in of_image:
@@ -331,40 +361,36 @@ def _try_start(
     geometry: TwoViewGeometry,
     known: KnownPoses,
     *,
-    limits: tuple[int, float],
+    limits: _Limits,
 ) -> _Start | None:
-    """Begin a model with a pair as the mapper does; None if the mapper rejects the pair.
-
-    `limits` are the fewest inliers and the smallest angle in degrees, see `_LIMITS`.
-    """
-    min_inliers, min_angle = limits
+    """Begin a model with a pair as the mapper does; None if the mapper rejects the pair."""
     some = _some_inliers(matched, cameras, pair, geometry)
     pose = _pose(geometry, some)
     if pose is None:
         return None
     angle = triangulation_angle(pose[:, :3], some.rays)
-    if not _is_wide(pose, angle / min_angle, _QUICK_SHARE):
+    if not limits.allow(pose, angle, _QUICK_SHARE):
         return None
     inliers = inliers_of(matched, cameras, pair, geometry)
     rotations, certain = list[_Floats](), list[bool]()
     for rows, pose, angle in _poses(inliers):
         # A pose just below the limits is tried, too: with another seed the mapper may accept it.
-        share = angle / min_angle
-        if len(rows) * _MARGIN < min_inliers or not _is_wide(pose, share, 1 / _MARGIN):
+        enough = len(rows) * _MARGIN >= limits.min_inliers
+        if not enough or not limits.allow(pose, angle, 1 / _MARGIN):
             continue
         rotation = pose[:, :3]
         if known.contradict(pair, rotation, angle):
             return _Start(is_stable=False, is_certain=False)
         # Adjustment from nearly the same pose has the same result, so it is not repeated.
         if all(_angle_between(own, rotation) > _SAME * angle for own in rotations):
-            is_stable = _is_stable(inliers, rows, pose, min_angle)
+            is_stable = _is_stable(inliers, rows, pose, limits.min_angle)
             if is_stable is None:
                 continue
             if not is_stable:
                 return _Start(is_stable=False, is_certain=False)
         rotations.append(rotation)
-        enough = len(rows) >= _MARGIN * min_inliers
-        certain.append(enough and _is_wide(pose, share, _MARGIN))
+        enough = len(rows) >= _MARGIN * limits.min_inliers
+        certain.append(enough and limits.allow(pose, angle, _MARGIN))
     if not certain:
         return None
     return _Start(True, len(certain) >= _NUM_SEEDS and all(certain))
@@ -384,6 +410,9 @@ def _some_inliers(
 
 def _pose(geometry: TwoViewGeometry, inliers: PairInliers) -> _Floats | None:
     """The pose of a pair from its two-view geometry, float64 [3, 4]; None if it has no matrix."""
+    if geometry.qvec is not None and geometry.tvec is not None:
+        rotation = pycolmap.Rotation3d(np.roll(geometry.qvec, -1)).matrix()
+        return np.column_stack([rotation, geometry.tvec])
     if geometry.config in FLAT_CONFIGS and geometry.H is not None:
         return pose_of_homography(geometry.H, inliers)
     E = geometry.E
@@ -391,15 +420,6 @@ def _pose(geometry: TwoViewGeometry, inliers: PairInliers) -> _Floats | None:
         a, b = (camera.calibration_matrix() for camera in inliers.cameras)
         E = b.T @ geometry.F @ a
     return None if E is None else pose_of_essential(E, inliers)
-
-
-def _is_wide(pose: _Floats, share: float, margin: float) -> bool:
-    """Whether a pair meets the mapper's limits of angle and forward motion, within a margin.
-
-    `share` is the pair's angle divided by the smallest one that the mapper accepts.
-    """
-    most = INITIAL_MAX_FORWARD_MOTION + (_FORWARD_MARGIN if margin < 1 else -_FORWARD_MARGIN)
-    return bool(share >= margin and abs(pose[2, 3]) <= most)
 
 
 def _poses(inliers: PairInliers) -> Iterator[tuple[NDArray[np.uint32], _Floats, float]]:

@@ -12,5 +12,10 @@ INITIAL_MIN_ANGLE = 16.0
 INITIAL_MIN_POINTS = 30
 # If no pair has that angle, the mapper halves it twice.
 INITIAL_LEAST_ANGLE = INITIAL_MIN_ANGLE / 4
-# With this init_max_forward_motion, forward motion excludes no pair.
-ANY_FORWARD_MOTION = 1.0
+# The mapper's options for the initial pair if the camera moves along its axis, as on a drive. Its
+# motion then excludes no pair. All angles are small: with the default limit the mapper would try
+# hundreds of pairs, and begin with the first to which RANSAC gives a wrong pose with a large angle.
+FORWARD_MOTION_OPTIONS = {
+    "init_max_forward_motion": 1.0,
+    "init_min_tri_angle": INITIAL_LEAST_ANGLE,
+}

@@ -78,7 +78,8 @@ class MapOptions(Options):
     mapper: Mapper = option("incremental", "COLMAP's mapper to use", common=True)
     forward_motion: bool = option(
         False,
-        "let the incremental mapper start with a pair that moves along the optical axis",
+        "let the incremental mapper start with a pair that moves along the optical axis, and with "
+        "a small angle",
         common=True,
     )
     refine_intrinsics: bool | None = option(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import read_model
-from colmap_av1.matching.mapper_limits import ANY_FORWARD_MOTION
+from colmap_av1.matching.mapper_limits import FORWARD_MOTION_OPTIONS
 from colmap_av1.options import MapOptions
 from colmap_av1.poses import mapper_process as child
 from colmap_av1.poses.mapper_process import run_mapping
@@ -147,7 +147,7 @@ def _mapping_settings(
         "image_path": str(image_path) if image_path is not None else None,
         "mapper": options.mapper,
         "refine_intrinsics": refine if refine is not None else not options.forward_motion,
-        "init_max_forward_motion": ANY_FORWARD_MOTION if options.forward_motion else None,
+        "initial_pair": FORWARD_MOTION_OPTIONS if options.forward_motion else {},
         "seed": options.seed,
         "num_threads": threads_or_cpus(options.num_threads),
         "start_tracks": None,

@@ -83,7 +83,8 @@ def starting_pair(
         The pair; None if the mapper would accept none, however it is matched.
     """
     candidates = list(_candidates(point, view, xyz, images))
-    for angle in (_MARGIN * INITIAL_MIN_ANGLE, _MARGIN * INITIAL_MIN_ANGLE / 2):
+    for share in (1, 1 / 2, 1 / 4):
+        angle = share * _MARGIN * INITIAL_MIN_ANGLE
         for forward in (False, True):
             fit = [c for c in candidates if c.is_forward == forward]
             counts = [len(c.wide(angle)) for c in fit]

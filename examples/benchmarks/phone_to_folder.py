@@ -55,6 +55,7 @@ from colmap_av1.evaluate import (
 )
 from colmap_av1.evaluate.frontends.frontend import list_images
 from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.matching.mapper_limits import FORWARD_MOTION_OPTIONS
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 from colmap_av1.video.coded_size import with_downscale
@@ -248,7 +249,8 @@ def map_incrementally(database: Path, images: Path, output: Path, forward: bool)
     pycolmap.set_random_seed(0)
     how = pycolmap.IncrementalPipelineOptions(random_seed=0)
     if forward:
-        how.mapper.init_max_forward_motion = 1.0
+        for name, value in FORWARD_MOTION_OPTIONS.items():
+            setattr(how.mapper, name, value)
         how.ba_refine_focal_length = False
         how.ba_refine_extra_params = False
     pycolmap.incremental_mapping(database, images, output, options=how)
