@@ -262,7 +262,7 @@ def look(centre: FloatArray, target: FloatArray, turn: FloatArray) -> FloatArray
     right = np.cross(forward, [0, 0, 1.0])
     right /= np.linalg.norm(right)
     rotation = cv2.Rodrigues(turn)[0] @ np.stack([right, np.cross(forward, right), forward])
-    return np.c_[rotation, -rotation @ centre]
+    return np.column_stack([rotation, -rotation @ centre])
 
 
 def _camera_path() -> FloatArray:
@@ -1173,7 +1173,7 @@ def encode(frames: Iterator[NDArray[np.uint8]], output: Path, crf: int = CRF) ->
     executable = os.environ.get("IMAGEIO_FFMPEG_EXE")
     if not executable:
         # Only encoding needs this package, not importing the ground truth.
-        import imageio_ffmpeg  # type: ignore[import-untyped]  # noqa: PLC0415
+        import imageio_ffmpeg  # noqa: PLC0415
 
         executable = imageio_ffmpeg.get_ffmpeg_exe()
     colour = "bt709"

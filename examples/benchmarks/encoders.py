@@ -45,7 +45,12 @@ from colmap_av1.util.stages import run_stage_in
 from colmap_av1.video.encode import encode
 from colmap_av1.video.encoders import find_encoder
 
-HARDWARE = ("nvenc", "qsv", "amf", "vaapi")
+HARDWARE = (
+    EncodeOptions("nvenc"),
+    EncodeOptions("qsv"),
+    EncodeOptions("amf"),
+    EncodeOptions("vaapi"),
+)
 SETTINGS = (
     *(EncodeOptions("libaom", 20, speed) for speed in (6, 7, 8, 9, 10)),
     EncodeOptions("libaom", 32, 8),
@@ -107,7 +112,7 @@ def main() -> int:
     arguments = parser.parse_args()
     console = Console(stderr=True)
     wanted = [setting for setting in SETTINGS if name_of(setting) in arguments.settings]
-    settings = [*filter(works, (EncodeOptions(name) for name in HARDWARE)), *wanted]
+    settings = [*filter(works, HARDWARE), *wanted]
     with ExitStack() as stack:
         cache = arguments.cache or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         for clip in arguments.clips:

@@ -18,6 +18,7 @@ import statistics
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
 import render
@@ -174,7 +175,7 @@ def measure_case(
     return measured
 
 
-def step_of(run: Measured | MapperRun) -> Step:
+def step_of(run: Measured[Any] | MapperRun) -> Step:
     """Cost of a measured process."""
     return Step(run.seconds, run.cpu_seconds, run.peak_memory or 0)
 

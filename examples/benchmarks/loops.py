@@ -66,7 +66,7 @@ def look(centre: Floats, target: Floats, turn: Floats) -> Floats:
     right = np.cross(ahead, [0, 0, 1.0])
     right /= np.linalg.norm(right)
     rotation = cv2.Rodrigues(turn)[0] @ np.stack([right, np.cross(ahead, right), ahead])
-    return np.c_[rotation, -rotation @ centre]
+    return np.column_stack([rotation, -rotation @ centre])
 
 
 def wall(start: tuple[float, float], end: tuple[float, float], material: str) -> Any:

@@ -337,7 +337,7 @@ def sift_of(
         matched = run_measured(run_matching, database, log=log)
         return {"features": taken(extracted), "matches": taken(matched)}
 
-    given = [file_digest(clip.video), names]
+    given: list[Any] = [file_digest(clip.video), names]
     written = run_stage_in(images.parent, given, write, products=[images], timed=True).result
     given = [*given, clip.camera, pycolmap.__version__]
     matching = run_stage_in(

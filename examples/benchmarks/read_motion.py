@@ -247,6 +247,7 @@ def decode(path: Path, threads: int) -> int:
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         decoder = av.CodecContext.create("libdav1d", "r")
+        assert isinstance(decoder, av.VideoCodecContext)
         decoder.extradata = stream.codec_context.extradata
         decoder.thread_count = threads
         pictures = 0

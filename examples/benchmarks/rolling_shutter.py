@@ -53,7 +53,7 @@ def poses(clip: str, t: Floats) -> Floats:
     level = room.look(centre, centre + ahead)
     one, none = np.ones_like(c), np.zeros_like(c)
     rows = [[np.cos(c), -np.sin(c), none], [np.sin(c), np.cos(c), none], [none, none, one]]
-    return np.array(rows).transpose(2, 0, 1) @ level
+    return np.asarray(np.array(rows).transpose(2, 0, 1) @ level)
 
 
 def make_clip(path: Path, clip: str, read_out: float) -> None:
@@ -112,6 +112,7 @@ def measure(video: Path, output: Path, clip: str, how: str) -> dict[str, Any]:
 def centre_error(found: Floats, exact: Floats) -> float:
     """RMS distance of camera centres after similarity alignment (Umeyama 1991)."""
     fit = pycolmap.estimate_sim3d(found, exact)
+    assert fit is not None
     moved = fit.scale * found @ fit.rotation.matrix().T + fit.translation
     return float(np.sqrt(((moved - exact) ** 2).sum(axis=1).mean()))
 

@@ -101,7 +101,7 @@ def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
     given = [file_digest(clip.video), names, clip.camera, pycolmap.__version__]
 
     def map_sift() -> dict[str, Any]:
-        _, found, pictures = phone_to_folder.sift_of(clip, folder / "sift", names)
+        _, found, pictures = phone_to_folder.sift_of(clip, folder / "sift", names, mapped=True)
         if found is None:
             raise SystemExit(f"{clip.name}: SIFT made no model")
         shutil.copytree(found, undistorted / "distorted")

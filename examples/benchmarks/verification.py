@@ -21,6 +21,7 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -89,7 +90,7 @@ def main() -> int:
     return 1 if failed else 0
 
 
-def fill_database(name: str, preset: str, cache: Path) -> Path:
+def fill_database(name: str, preset: Literal["sparse", "default", "dense"], cache: Path) -> Path:
     """The database of a clip, filled in the cache if it is missing."""
     database = cache / f"{name}_{preset}.db"
     if database.exists():
