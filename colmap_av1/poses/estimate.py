@@ -38,6 +38,8 @@ from colmap_av1.util.stages import Kept, run_stage
 
 # Number of the adjustment after the first split; 1 and 2 follow the first and second mapping.
 _FIRST_SPLIT = 3
+# A second mapping of the first model must agree with this share of the observations.
+_LEAST_KEPT = 0.9
 
 
 @dataclass(frozen=True)
@@ -233,7 +235,8 @@ def _pose_stages(
         keyed=keyed,
         has_picture_positions=has_picture_positions,
     )
-    posed = remapped_poses(run, posed, image_set)
+    if _is_doubtful(posed):
+        posed = remapped_poses(run, posed, image_set, least_kept=_LEAST_KEPT)
     return replace(posed, far_views=_long_range_check(run, posed, image_set))
 
 
@@ -252,19 +255,30 @@ def trusted_tracks(
     return every.split_after_frames(broken.tolist()), links
 
 
-def remapped_poses(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
+def _is_doubtful(posed: Posed) -> bool:
+    """Whether links replace motion, and points connect the adjusted model poorly somewhere."""
+    if posed.adjustment is None:
+        return False
+    links, adjusted = posed.matches.result.links, posed.adjustment.result
+    return bool((links.gaps or links.fast) and (adjusted.doubtful_seams or adjusted.turns))
+
+
+def remapped_poses(run: Run, posed: Posed, image_set: ImageSet, *, least_kept: float) -> Posed:
     """Map the images again from the adjusted observations, and use that unless its cost is higher.
 
-    See `remapping`. Nothing is mapped again if links replace no motion, if the adjusted model holds
-    together well, or if the adjustment did not use corners.
+    See `remapping`. Nothing is mapped again if the adjustment did not use corners.
+
+    Args:
+        run: the run.
+        posed: the adjusted poses.
+        image_set: the images.
+        least_kept: the second mapping is rejected if a smaller share of the observations agrees
+            with it.
     """
     if posed.adjustment is None or not posed.has_picture_positions:
         return posed
-    links, adjusted = posed.matches.result.links, posed.adjustment.result
-    if not (links.gaps or links.fast) or not (adjusted.doubtful_seams or adjusted.turns):
-        return posed
     again = remap_stage(run, image_set, posed.mapped, posed.adjustment)
-    if not again.result.is_used:
+    if not again.result.fits(least_kept):
         return posed
     posed = replace(posed, mapped=again)
     return replace(posed, adjustment=_adjusted(run, posed, image_set, again, number=2))

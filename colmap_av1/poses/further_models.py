@@ -10,7 +10,13 @@ from pathlib import Path
 from colmap_av1.errors import ModelError, cannot_write
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.estimate import Posed, refined_poses, split_at_seams, trusted_tracks
+from colmap_av1.poses.estimate import (
+    Posed,
+    refined_poses,
+    remapped_poses,
+    split_at_seams,
+    trusted_tracks,
+)
 from colmap_av1.poses.parts import FEWEST_IMAGES
 from colmap_av1.poses.pose_stages import MappedResult
 from colmap_av1.poses.run import Run
@@ -21,6 +27,9 @@ from colmap_av1.util.stages import Kept, remove_products, run_stage
 
 # Folders of further models, each followed by its number.
 _FOLDER = "model_"
+# Few points determine a further model, so its first mapping may be wrong, and its observations too.
+# A correct second mapping agrees with as few as this share of them.
+_LEAST_KEPT = 0.3
 
 
 @dataclass(frozen=True)
@@ -76,6 +85,7 @@ def further_poses(
                 keyed=_named(image_set, known),
                 has_picture_positions=first.has_picture_positions,
             )
+            posed = remapped_poses(own, posed, some, least_kept=_LEAST_KEPT)
             posed = split_at_seams(own, posed, some)
         except ModelError:  # too few tracks agree with these poses
             continue

@@ -4,7 +4,8 @@ Bundle adjustment converges to a local minimum. If few tracks cross a fast turn,
 may be bent, and bundle adjustment does not straighten it. Even so, the corners that were found with
 its poses form longer and more accurate tracks than the motion that it was mapped from. A model that
 is mapped from these is usually less bent. Its cost may be about the same, because hardly any points
-carry the scale across such a turn.
+carry the scale across such a turn. Models that are not connected to the first are always mapped
+again: few points determine them.
 """
 
 from __future__ import annotations
@@ -46,9 +47,8 @@ from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
-# The second mapping is rejected if it registers fewer images than this share, or if fewer of the
-# observations in its images than this share agree with it.
-_LEAST_REGISTERED, _LEAST_KEPT = 0.5, 0.9
+# The second mapping is rejected if it registers a smaller share of the images than this.
+_LEAST_REGISTERED = 0.5
 # It is rejected if its cost exceeds this multiple of the first cost. Costs at the same minimum
 # differ by 0.1 %. On 18 walks the ratio was 0.94 to 1.0004, and the error of camera centres fell to
 # 0.01 to 0.9 of the first on 17 of them; on the other it rose from 0.2 to 0.3 % of the extent. On
@@ -75,10 +75,13 @@ class RemappedResult(MappedResult):
     cost: float
     new_cost: float
 
-    @property
-    def is_used(self) -> bool:
-        """Whether it is large enough and fits the observations about as well as the first."""
-        is_whole = self.share >= _LEAST_REGISTERED and self.kept >= _LEAST_KEPT
+    def fits(self, least_kept: float) -> bool:
+        """Whether it is large enough and fits the observations about as well as the first.
+
+        Args:
+            least_kept: smallest share of the observations that must agree with it.
+        """
+        is_whole = self.share >= _LEAST_REGISTERED and self.kept >= least_kept
         return is_whole and self.new_cost <= _MAX_COST_RATIO * self.cost
 
 

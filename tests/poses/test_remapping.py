@@ -75,11 +75,12 @@ def test_second_mapping_is_used_if_it_fits_at_least_as_well() -> None:
     def result(kept: float, new_cost: float, share: float = 1.0) -> RemappedResult:
         return RemappedResult("", 3, {}, "global", (), share, kept, cost=1.0, new_cost=new_cost)
 
-    assert result(kept=0.97, new_cost=0.8).is_used
-    assert result(kept=0.97, new_cost=1.0).is_used
-    assert not result(kept=0.97, new_cost=1.1).is_used
-    assert not result(kept=0.5, new_cost=0.1).is_used
-    assert not result(kept=0.97, new_cost=0.1, share=0.2).is_used
+    assert result(kept=0.97, new_cost=0.8).fits(0.9)
+    assert result(kept=0.97, new_cost=1.0).fits(0.9)
+    assert not result(kept=0.97, new_cost=1.1).fits(0.9)
+    assert not result(kept=0.5, new_cost=0.1).fits(0.9)
+    assert result(kept=0.5, new_cost=0.1).fits(0.3)
+    assert not result(kept=0.97, new_cost=0.1, share=0.2).fits(0.9)
 
 
 def tracks_of_lengths(length: int, num_frames: int = 60) -> Tracks:
