@@ -1,4 +1,4 @@
-"""The comparison of front-ends as one command: its columns, report, resume and refusals."""
+"""`compare`: its results, report, resumed runs and errors."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
-from conftest import PROJECT
+from conftest import AV1, PROJECT
 
 from colmap_av1 import compare as compare_module
 from colmap_av1.cli import main
@@ -34,16 +34,15 @@ OPTIONS = MatchOptions(images=ImageOptions(every=6), camera=CAMERA)
 
 @pytest.fixture(scope="module")
 def video(ffmpeg, tmp_path_factory):
-    """The rendered clip at half its size: 48 frames 320x180."""
-    words = "-frames:v 48 -vf scale=320:180 -c:v libaom-av1 -usage realtime -cpu-used 6 -crf 20"
+    """48 frames of the rendered clip at half the size, 320x180."""
     scene = PROJECT / "examples" / "scene.mp4"
     output = tmp_path_factory.mktemp("video") / "small.mp4"
-    return ffmpeg("-i", scene, *words.split(), "-b:v", "0", "-lag-in-frames", "0", output)
+    return ffmpeg("-i", scene, "-frames:v", "48", "-vf", "scale=320:180", *AV1, output)
 
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
-    """The clip's true poses as a file."""
+    """A file of the true poses of the clip."""
     path = tmp_path_factory.mktemp("truth") / "poses.txt"
     with np.load(PROJECT / "examples" / "scene_truth.npz") as known:
         poses = known["cam_from_world"][:48]
@@ -58,7 +57,7 @@ def truth(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def one_cpu():
-    """Give the mapper one thread: with several, its results vary from run to run."""
+    """Run on one CPU, because the results of the mapper vary if it has several threads."""
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
     yield
@@ -67,7 +66,7 @@ def one_cpu():
 
 @pytest.fixture(scope="module")
 def compared(video, truth, tmp_path_factory):
-    """The folder of a comparison in which one of the front-ends fails, made by the command."""
+    """The output of the command for three front-ends, one of which fails."""
     output = tmp_path_factory.mktemp("compared") / "report"
     words = ["--frontends", "av1,sift-exhaustive,broken=no.h5:none.h5", "--every", "6"]
     words += ["--camera_model", "PINHOLE", "--camera_params", CAMERA.camera_params]
@@ -76,11 +75,12 @@ def compared(video, truth, tmp_path_factory):
     return output
 
 
-def test_no_model_at_all_is_an_error(video, tmp_path, capsys):
+def test_report_is_written_even_if_all_front_ends_fail(video, tmp_path, capsys):
+    """The report escapes the name of the video."""
     words = ["--frontends", "broken=no.h5:none.h5", "--every", "6", "--quiet"]
-    output, hostile = tmp_path / "report", tmp_path / "<script>.mp4"
-    shutil.copy(video, hostile)
-    assert main(["compare", "--video", str(hostile), "--output", str(output), *words]) == 2
+    output, named = tmp_path / "report", tmp_path / "<script>.mp4"
+    shutil.copy(video, named)
+    assert main(["compare", "--video", str(named), "--output", str(output), *words]) == 2
     assert "no front-end" in capsys.readouterr().err.splitlines()[-1]
     html = (output / "report.html").read_text()
     assert "no.h5" in html
@@ -88,8 +88,8 @@ def test_no_model_at_all_is_an_error(video, tmp_path, capsys):
     assert "<script>" not in html
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
-def test_a_video_whose_name_is_not_utf_8(video, tmp_path):
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not allow such names")
+def test_name_of_the_video_need_not_be_utf_8(video, tmp_path):
     named = tmp_path / os.fsdecode(b"loc\xe9.mp4")
     shutil.copy(video, named)
     words = ["--frontends", "broken=no.h5:none.h5", "--every", "6", "--quiet"]
@@ -106,12 +106,12 @@ def run_again(video, output, truth, *frontends):
 
 
 def times(output):
-    """When the results that are kept were written."""
+    """Modification times of the results of the stages of all front-ends."""
     return {str(p): p.stat().st_mtime_ns for p in (output / "frontends").glob("*/*/result.json")}
 
 
 @pytest.mark.slow
-def test_columns_hold_what_their_models_say(compared):
+def test_results_describe_the_models(compared):
     results = json.loads((compared / "results.json").read_text())
     assert (results["num_images"], results["num_frames"], results["size"]) == (8, 48, [320, 180])
     assert results["is_truth"]
@@ -141,7 +141,7 @@ def test_columns_hold_what_their_models_say(compared):
 
 
 @pytest.mark.slow
-def test_the_report_needs_no_other_file(compared):
+def test_report_refers_to_no_other_file(compared):
     html = (compared / "report.html").read_text()
     sources = re.findall(r'src="([^"]*)"', html)
     assert len(sources) == 3 + 2 * 3
@@ -154,13 +154,13 @@ def test_the_report_needs_no_other_file(compared):
 
 
 @pytest.mark.slow
-def test_another_run_does_only_what_is_missing(compared, video, truth, tmp_path):
+def test_later_runs_redo_only_what_has_changed(compared, video, truth, tmp_path):
     output = tmp_path / "report"
     shutil.copytree(compared, output)
     before = times(output)
     first = json.loads((output / "results.json").read_text())
     assert len(before) == 5
-    # An image that is overwritten is made again, and all that came of it stands.
+    # A changed image is written again, and the results are kept because it is the same as before.
     images = output / "footage" / "images"
     image = images / "frame_000006.png"
     content = image.read_bytes()
@@ -171,7 +171,7 @@ def test_another_run_does_only_what_is_missing(compared, video, truth, tmp_path)
     again = json.loads((output / "results.json").read_text())
     assert [c["seconds"] for c in again["columns"]] == [c["seconds"] for c in first["columns"]]
 
-    # A model as the truth: itself.
+    # A model can be the reference. Here it is compared with itself.
     model = output / "frontends" / "sift-exhaustive" / "mapped" / "model" / "0"
     report = run_again(video, output, model, "sift-exhaustive")
     (sift,) = report.columns
@@ -180,12 +180,12 @@ def test_another_run_does_only_what_is_missing(compared, video, truth, tmp_path)
     assert sift.cloud.hausdorff < 1e-6 * sift.cloud.extent
     assert times(output) == before
 
-    # Poses that the model does not have: its cloud stands for no truth.
+    # The poses of the SIFT model differ from these, so its points are not the reference cloud.
     lines = truth.read_text().splitlines()[1:]
     wrong = tmp_path / "wrong.txt"
     moved = [[w.split()[0], str(i % 5), *w.split()[2:]] for i, w in enumerate(lines)]
     wrong.write_text("\n".join(" ".join(words) for words in moved))
-    # SIFT's features and matches as other programs would hand them in: a new column.
+    # Features and matches of other programs get a column. Here they are those of SIFT.
     export_hloc(
         output / "frontends" / "sift-exhaustive" / "matches" / "database.db", tmp_path / "h"
     )
@@ -200,7 +200,7 @@ def test_another_run_does_only_what_is_missing(compared, video, truth, tmp_path)
     assert theirs.model.num_points == pytest.approx(sift.model.num_points, rel=0.1)
     assert {"import", "verification", "mapping"} == set(theirs.seconds)
 
-    # Other images are another input of every stage.
+    # Every stage of the front-end reads the images, so it runs again if they change.
     shutil.copytree(images, tmp_path / "images")
     image = tmp_path / "images" / "frame_000006.png"
     image.write_bytes((images / "frame_000012.png").read_bytes())
@@ -212,14 +212,15 @@ def test_another_run_does_only_what_is_missing(compared, video, truth, tmp_path)
 
 
 @pytest.mark.slow
-def test_what_is_damaged_is_made_again(compared, video, truth, tmp_path):
-    """Databases and models that front-ends and mapper gave, and their records."""
+def test_damaged_files_are_written_again(compared, video, truth, tmp_path):
+    """Databases, models and the records of stages are damaged."""
     output = tmp_path / "report"
     shutil.copytree(compared, output)
     folder = output / "frontends" / "av1"
     first = json.loads((output / "results.json").read_text())["columns"][0]
 
     def redone(damage):
+        """Names of the stages that run again after the damage."""
         before = times(output)
         damage()
         report = run_again(video, output, truth, "av1")
@@ -243,13 +244,13 @@ def test_what_is_damaged_is_made_again(compared, video, truth, tmp_path):
         record.write_text("[]")
 
     assert redone(damage_points_and_footage) == {"mapped"}
-    # The same database comes out, and what was mapped of it stands.
+    # The new database is the same as before, so its models are kept.
     assert redone(lambda: os.truncate(database, 4096)) == {"matches"}
     assert redone(damage_dense_model_and_record) == {"mapped", "all-tracks"}
 
 
 @pytest.mark.slow
-def test_a_run_that_is_stopped_goes_on(compared, video, truth, tmp_path, monkeypatch):
+def test_interrupted_run_is_resumed(compared, video, truth, tmp_path, monkeypatch):
     output = tmp_path / "report"
     shutil.copytree(compared, output)
     for name in ("mapped", "all-tracks"):
@@ -272,7 +273,8 @@ def test_a_run_that_is_stopped_goes_on(compared, video, truth, tmp_path, monkeyp
 
 
 @pytest.mark.slow
-def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
+def test_trainer_gets_half_of_the_images(compared, video, truth, tmp_path):
+    """The other half is rendered and compared. The trainer here copies the expected renderings."""
     output = tmp_path / "report"
     shutil.copytree(compared, output)
     copy = "shutil.copytree(*sys.argv[1:3], dirs_exist_ok=True)"
@@ -302,7 +304,7 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
     assert "frame_000030.png, photograph" in html
     assert "av1: 60.00 dB" in html
 
-    # Milestones that a command renders are in the report as those of gsplat are.
+    # The report shows the milestones that a command renders.
     script = tmp_path / "train.py"
     script.write_text(
         "import shutil, sys\n"
@@ -311,8 +313,8 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
         "open(sys.argv[2] + '/times.csv', 'w').write('iterations,seconds\\n3,1.5\\n7,4\\n')\n"
     )
     command = f"{sys.executable} {script} {{test}} {{renders}} {{milestones}} {{data}}"
-    on_the_way = replace(options, trainer=command, milestones=(3, 9))
-    (column,) = compare(video, output, reference=truth, options=on_the_way).columns
+    with_milestones = replace(options, trainer=command, milestones=(3, 9))
+    (column,) = compare(video, output, reference=truth, options=with_milestones).columns
     assert [(state.iteration, state.seconds) for state in column.training.states] == [
         (3, 1.5),
         (7, 4),
@@ -322,7 +324,7 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
     assert "<td>av1</td><td>60.00 / inf / 9" in text
     assert 'alt="Renderings over time"' in text
 
-    # What fails leaves its line, and figures of the clouds.
+    # A failed training is reported, and the figures of the model are kept.
     for command, message in (("false {data}", str(log)), ("echo {data}", "0 renderings")):
         options = replace(options, trainer=command)
         (column,) = compare(video, output, reference=truth, options=options).columns
@@ -332,7 +334,7 @@ def test_trainers_get_half_of_the_images(compared, video, truth, tmp_path):
         assert column.training_error in page
 
 
-def test_renderings_are_found_by_name_or_order(tmp_path):
+def test_renderings_are_matched_by_name_or_order(tmp_path):
     references = [tmp_path / f"frame_{i:06d}.png" for i in (1, 3, 5)]
     renders = tmp_path / "renders"
     renders.mkdir()
@@ -347,7 +349,7 @@ def test_renderings_are_found_by_name_or_order(tmp_path):
 
 
 @pytest.mark.slow
-def test_images_that_exist_and_nothing_to_measure_against(compared, video, tmp_path):
+def test_existing_images_are_compared_without_a_reference(compared, video, tmp_path):
     images = tmp_path / "pictures"
     images.mkdir()
     for i, path in enumerate(sorted((compared / "footage" / "images").iterdir())):
@@ -361,12 +363,12 @@ def test_images_that_exist_and_nothing_to_measure_against(compared, video, tmp_p
     assert not (report.output / "footage" / "images").exists()
 
 
-def test_a_failed_training_has_a_status_of_its_own(video, tmp_path, monkeypatch, capsys):
+def test_failed_training_has_its_own_exit_status(video, tmp_path, monkeypatch, capsys):
     error = "the trainer ended with status 1: see log"
     model = SimpleNamespace(num_registered=2, num_points=9, coverage=0.5, mean_error=0.3)
     failed = Column("av1", model=model, training_error=error)
-    fine = Column("sift", model=model)
-    for columns, status in (((fine, failed), 3), ((fine,), 0)):
+    good = Column("sift", model=model)
+    for columns, status in (((good, failed), 3), ((good,), 0)):
         report = SimpleNamespace(columns=columns, warnings=(), output=tmp_path, num_images=2)
         monkeypatch.setattr(compare_module, "compare", lambda *_, found=report, **__: found)
         words = ["compare", "--video", str(video), "--output", str(tmp_path), "--quiet"]
@@ -377,17 +379,17 @@ def test_a_failed_training_has_a_status_of_its_own(video, tmp_path, monkeypatch,
     assert error in err
 
 
-def test_what_cannot_work_is_refused_at_once(video, tmp_path, capsys):
+def test_invalid_arguments_are_errors_before_anything_is_written(video, tmp_path, capsys):
     output = tmp_path / "report"
     given = ["compare", "--video", str(video), "--output", str(output)]
-    refused = {
+    invalid = {
         "av1,surf": "surf",
         "av1,av1": "twice",
         "mine=features.h5": "MATCHES.h5",
         "av1=a.h5:b.h5": "name",
         "../x=a.h5:b.h5": "name",
     }
-    for frontends, message in refused.items():
+    for frontends, message in invalid.items():
         assert main([*given, "--frontends", frontends]) == 2
         error = capsys.readouterr().err
         assert error.count("\n") == 1
@@ -415,7 +417,7 @@ def test_what_cannot_work_is_refused_at_once(video, tmp_path, capsys):
         )
 
 
-def test_a_reference_of_other_images_is_refused(video, tmp_path):
+def test_reference_without_the_poses_of_the_images_is_an_error(video, tmp_path):
     poses = tmp_path / "poses.txt"
     poses.write_text("0.png 0 0 0 0 0 0 1\n1.png 1 0 0 0 0 0 1\n")
     options = CompareOptions(match=OPTIONS)
@@ -428,17 +430,22 @@ def test_a_reference_of_other_images_is_refused(video, tmp_path):
         compare(video, tmp_path / "report", reference=tmp_path / "none", options=options)
 
 
-def test_learned_features_are_matched_at_growing_distances():
+def test_learned_features_are_matched_at_distances_that_double():
     names = [f"{i:02}" for i in range(31)]
     assert pairs_of(names[:4], None) == [
-        *(("00", "01"), ("01", "02"), ("02", "03"), ("00", "02"), ("01", "03"), ("00", "03"))
+        ("00", "01"),
+        ("01", "02"),
+        ("02", "03"),
+        ("00", "02"),
+        ("01", "03"),
+        ("00", "03"),
     ]
     distances = Counter(int(b) - int(a) for a, b in pairs_of(names, None))
     assert distances == {1: 30, 2: 29, 4: 27, 8: 23}
     assert pairs_of(names, (3,))[-1] == ("27", "30")
 
 
-def test_learned_features_without_their_extra(tmp_path):
+def test_learned_features_without_torch_name_the_extra(tmp_path):
     program = PROJECT / "colmap_av1" / "evaluate" / "frontends" / "lightglue_matches.py"
     (tmp_path / "torch.py").write_text("raise ImportError(name='torch')")
     run = subprocess.run(
@@ -452,10 +459,11 @@ def test_learned_features_without_their_extra(tmp_path):
     )
     assert run.returncode == 3
     assert run.stderr.count("\n") == 1
-    assert "pip install 'colmap-av1[learned]'" in run.stderr
+    assert "colmap-av1[learned]" in run.stderr
 
 
-BLOCKED = """
+# Runs the command as if the packages of its first argument were not installed.
+WITHOUT_PACKAGES = """
 import sys
 for name in sys.argv.pop(1).split(","):
     sys.modules[name] = None
@@ -472,10 +480,10 @@ sys.exit(main())
         ("gsplat,torch", ["--trainer", "gsplat"], "splatting"),
     ],
 )
-def test_missing_packages_are_named_at_the_start(video, tmp_path, package, words, extra):
+def test_missing_packages_are_errors_at_the_start(video, tmp_path, package, words, extra):
     given = ["compare", "--video", video, "--output", tmp_path / "report", *words]
     run = subprocess.run(
-        [sys.executable, "-c", BLOCKED, package, *map(str, given)],
+        [sys.executable, "-c", WITHOUT_PACKAGES, package, *map(str, given)],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         capture_output=True,
@@ -484,12 +492,12 @@ def test_missing_packages_are_named_at_the_start(video, tmp_path, package, words
     )
     assert run.returncode == 2
     assert run.stderr.count("\n") == 1
-    assert f"pip install 'colmap-av1[{extra}]'" in run.stderr
+    assert f"colmap-av1[{extra}]" in run.stderr
     assert not (tmp_path / "report").exists()
 
 
-def test_without_matplotlib(video, tmp_path, monkeypatch):
-    """Even where it was there when the report was imported."""
+def test_missing_matplotlib_is_an_error_of_each_call(video, tmp_path, monkeypatch):
+    """It is an error even if matplotlib was present when `compare` was imported."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(EvaluationError, match="evaluate"):
         compare(video, tmp_path / "report")
