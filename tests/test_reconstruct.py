@@ -1,3 +1,5 @@
+"""`reconstruct`: its model, report, resumed runs and errors."""
+
 from __future__ import annotations
 
 import errno
@@ -51,17 +53,27 @@ OPTIONS_OF_ALL_FRAMES = replace(OPTIONS, match=MatchOptions())
 
 @pytest.fixture
 def copy(made: ReconstructReport, tmp_path: Path) -> Path:
-    """A copy of the finished output, which another run resumes."""
+    """A copy of the finished output, for a run that resumes it."""
     return Path(shutil.copytree(made.output, tmp_path / "out"))
 
 
 def products(output: Path) -> dict[Path, bytes]:
-    """The images and models of an output."""
+    """Contents of the images and models of an output."""
     return {p: p.read_bytes() for p in output.glob("[is]*/**/*.*")}
 
 
-def test_files_agree(made: ReconstructReport) -> None:
-    """Images and points have the same observations, and the errors are those of the poses."""
+def interrupt_at(stage: str) -> Callable[[str, int, int | None], None]:
+    """A progress callback that interrupts the run when it reaches a stage."""
+
+    def interrupt(reached: str, done: int, total: int | None) -> None:
+        if reached == stage:
+            raise KeyboardInterrupt
+
+    return interrupt
+
+
+def test_images_and_points_of_the_model_agree(made: ReconstructReport) -> None:
+    """They have the same observations, and the errors of points follow from the poses."""
     model = pycolmap.Reconstruction(made.output / "sparse" / "0")
     (camera,) = model.cameras.values()
     assert model.num_points3D() == made.num_points
@@ -69,23 +81,23 @@ def test_files_agree(made: ReconstructReport) -> None:
     for point_id in sorted(model.points3D)[::101]:
         point = model.points3D[point_id]
         errors = []
-        for seen in point.track.elements:
-            image = model.images[seen.image_id]
-            keypoint = image.points2D[seen.point2D_idx]
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            keypoint = image.points2D[element.point2D_idx]
             assert keypoint.point3D_id == point_id
             at = camera.img_from_cam(image.cam_from_world() * point.xyz)
             errors.append(np.linalg.norm(at - keypoint.xy))
-        assert len({seen.image_id for seen in point.track.elements}) >= 3
+        assert len({element.image_id for element in point.track.elements}) >= 3
         assert max(errors) <= 2.0 + 1e-6
         assert np.mean(errors) == pytest.approx(point.error, abs=1e-6)
     assert model.compute_mean_reprojection_error() == pytest.approx(made.mean_error)
 
 
-def test_trainers_can_read_the_model(made: ReconstructReport) -> None:
-    """A pinhole camera, flat names with one dot, images in order of their names, and colours.
+def test_model_has_the_form_that_trainers_need(made: ReconstructReport) -> None:
+    """It has pinhole cameras, image names with one dot and no folder, and coloured points.
 
-    gaussian-splatting takes two pinhole models only, and a name up to its first dot; gsplat pairs
-    sorted names with sorted files; OpenSplat finds an image by its file name.
+    gaussian-splatting accepts only the two pinhole models, and cuts an image name at its first dot.
+    gsplat pairs sorted names with sorted files. OpenSplat finds an image by its file name.
     """
     folder = made.output / "sparse" / "0"
     assert {"cameras.bin", "images.bin", "points3D.bin"} <= {p.name for p in folder.iterdir()}
@@ -103,41 +115,41 @@ def test_trainers_can_read_the_model(made: ReconstructReport) -> None:
     assert rgb.std() > 10
 
 
-def test_colours_are_pixels_of_the_images(made: ReconstructReport) -> None:
-    """Those of one image, up to what JPEG changes."""
+def test_colours_of_points_are_pixels_of_the_images(made: ReconstructReport) -> None:
+    """Each point has the colour of a pixel in one of its images. JPEG changes it a little."""
     model = read_model(made.output / "sparse" / "0")
     pictures = {
         i: cv2.imread(str(made.output / "images" / image.name))[..., ::-1].astype(int)
         for i, image in model.images.items()
     }
-    nearest = []
+    smallest = []
     for point in list(model.points3D.values())[::50]:
-        off = []
-        for seen in point.track.elements:
-            x, y = model.images[seen.image_id].points2D[seen.point2D_idx].xy.astype(int)
-            off.append(np.abs(pictures[seen.image_id][y, x] - point.color).max())
-        nearest.append(min(off))
-    assert np.median(nearest) <= 3
-    assert max(nearest) <= 25
+        differences = []
+        for element in point.track.elements:
+            x, y = model.images[element.image_id].points2D[element.point2D_idx].xy.astype(int)
+            differences.append(np.abs(pictures[element.image_id][y, x] - point.color).max())
+        smallest.append(min(differences))
+    assert np.median(smallest) <= 3
+    assert max(smallest) <= 25
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_trainers_take_the_finished_model(
+def test_trainers_read_the_finished_model(
     made: ReconstructReport, trainer: Callable[[Path], Taken]
 ) -> None:
-    check_taken(trainer(made.output), made.output)
+    check_files_of_trainer(trainer(made.output), made.output)
 
 
-def check_taken(taken: Taken, output: Path) -> None:
-    """A trainer takes the model of a folder, with its own pictures and points."""
+def check_files_of_trainer(taken: Taken, output: Path) -> None:
+    """Check that a trainer reads the model of an output, with its pictures and points."""
     assert taken.model == output / "sparse" / "0"
     assert taken.points == taken.model / "points3D.bin"
     assert all(picture == output / "images" / name for name, picture in taken.pictures.items())
     assert all(picture.is_file() for picture in taken.pictures.values())
 
 
-def test_nothing_else_in_the_folder_looks_like_input_of_a_trainer(made: ReconstructReport) -> None:
-    """Brush and others search hidden folders, too."""
+def test_no_other_file_looks_like_an_input_of_a_trainer(made: ReconstructReport) -> None:
+    """Brush and other trainers search hidden folders, too."""
     kinds = re.compile(
         r"(cameras|images|points3D)\..*|transforms.*\.json|.*\.(ply|png|jpe?g)", re.IGNORECASE
     )
@@ -149,22 +161,22 @@ def test_nothing_else_in_the_folder_looks_like_input_of_a_trainer(made: Reconstr
     assert found == {"images", "sparse"}
 
 
-def test_models_among_the_stages_of_an_earlier_version_go(copy: Path) -> None:
-    """Such folders had a model with as many images as the finished one, and a smaller path."""
+def test_models_in_the_stages_of_earlier_versions_are_removed(copy: Path) -> None:
+    """Brush prefers such a model: it has as many images as the finished one and a smaller path."""
     for name in ("poses/0", "placed", "adjusted"):
         shutil.copytree(copy / "sparse" / "0", copy / ".stages" / name)
     assert brush(copy).model == copy / ".stages" / "adjusted"
     reconstruct(SCENE, copy, options=OPTIONS)
-    check_taken(brush(copy), copy)
+    check_files_of_trainer(brush(copy), copy)
 
 
-def test_masks_are_those_of_the_model(copy: Path) -> None:
+def test_trainer_finds_the_masks_of_the_images(copy: Path) -> None:
     masked = reconstruct(SCENE, copy, options=replace(OPTIONS, moving="mask"))
     for name, masks in brush(masked.output).masks.items():
         assert masks == {masked.output / "masks" / Path(name).with_suffix(".png").name}
 
 
-def test_poses_are_true(made: ReconstructReport, truth: Truth) -> None:
+def test_poses_are_accurate(made: ReconstructReport, truth: Truth) -> None:
     model = read_model(made.output / "sparse" / "0")
     errors = pose_errors(model_poses(model, 60), truth.cam_from_world)
     assert errors.num_poses == NUM_IMAGES
@@ -174,14 +186,15 @@ def test_poses_are_true(made: ReconstructReport, truth: Truth) -> None:
     assert made.mean_error < 0.5
 
 
-def test_report(made: ReconstructReport, tmp_path: Path) -> None:
+def test_report_describes_the_result(made: ReconstructReport, tmp_path: Path) -> None:
     report = json.loads((made.output / "report.json").read_text())
     assert report["num_points"] == made.num_points
     assert report["mapper"] == "global"
     assert set(report["seconds"]) >= {"motion", "poses", "points", "images"}
     assert report["cpu_seconds"].keys() == report["seconds"].keys()
-    assert report["cpu_seconds"]["poses"] > 0.1  # which another process takes
-    # pycolmap brings a database to its own layout.
+    # This time is spent in another process.
+    assert report["cpu_seconds"]["poses"] > 0.1
+    # pycolmap migrates the database that it opens.
     shutil.copyfile(made.database, tmp_path / "copy.db")
     with pycolmap.Database.open(tmp_path / "copy.db") as database:
         assert database.num_images() == made.num_key_images == len(range(0, NUM_IMAGES, 2)) + 1
@@ -191,51 +204,41 @@ def test_report(made: ReconstructReport, tmp_path: Path) -> None:
 def test_forward_motion_is_reported(made: ReconstructReport) -> None:
     assert not made.forward_motion
     assert "motion" not in dict(reconstruct_rows(made))
-    (said,) = (
+    (motion,) = (
         value
         for name, value in reconstruct_rows(replace(made, forward_motion=True))
         if name == "motion"
     )
-    assert "forward" in said
+    assert "forward" in motion
 
 
-def test_short_tracks_are_for_points_only(tmp_path: Path) -> None:
-    """The database that poses come from is the same with and without them, byte for byte."""
-
-    def stop(stage: str, done: int, total: int | None) -> None:
-        if stage == "poses":
-            raise KeyboardInterrupt
-
+def test_short_tracks_are_not_in_the_database(tmp_path: Path) -> None:
+    """Only the points use them. The database, and thus the poses, do not depend on them."""
     written = []
     for name, tracks in (("all", TrackOptions()), ("longer", TrackOptions(min_length=4))):
         options = replace(OPTIONS, match=MatchOptions(tracks=tracks))
         with pytest.raises(KeyboardInterrupt):
-            reconstruct(SCENE, tmp_path / name, options=options, progress=stop)
+            reconstruct(SCENE, tmp_path / name, options=options, progress=interrupt_at("poses"))
         with np.load(tmp_path / name / ".stages" / "tracks.npz") as file:
             written.append((np.diff(file["offsets"]).min(), tmp_path / name / "database.db"))
     assert [shortest for shortest, _ in written] == [3, 4]
     assert written[0][1].read_bytes() == written[1][1].read_bytes()
 
 
-def test_long_videos_have_fewer_images_than_frames(tmp_path: Path) -> None:
-    """Of 60 frames about as many as asked for become images, unless an option says which.
+def test_max_images_limits_the_images_of_long_videos(tmp_path: Path) -> None:
+    """The limit is approximate, and does not apply if `every` is given.
 
-    Of many more frames twice as many are looked at.
+    If a video has many more frames than `max_images`, only twice as many frames are candidates.
     """
-
-    def stop(stage: str, *_: object) -> None:
-        if stage == "pairs":
-            raise KeyboardInterrupt
-
     chosen = []
-    for name, images, most in (
+    for name, images, max_images in (
         ("few", ImageOptions(), 25),
         ("all", ImageOptions(every=1), 25),
         ("fewer", ImageOptions(), 10),
     ):
-        options = ReconstructOptions(match=MatchOptions(images=images), max_images=most)
+        options = ReconstructOptions(match=MatchOptions(images=images), max_images=max_images)
         with pytest.raises(KeyboardInterrupt):
-            reconstruct(SCENE, tmp_path / name, options=options, progress=stop)
+            reconstruct(SCENE, tmp_path / name, options=options, progress=interrupt_at("pairs"))
         with np.load(tmp_path / name / ".stages" / "tracks.npz") as file:
             chosen.append(file["frames"])
             np.testing.assert_array_equal(np.unique(file["frame"]), chosen[-1])
@@ -247,18 +250,13 @@ def test_long_videos_have_fewer_images_than_frames(tmp_path: Path) -> None:
     assert set(chosen[2].tolist()) <= set(evenly_spread(60, 20))
 
 
-def test_it_is_no_matter_how_often_the_motion_of_a_long_video_is_read(
+def test_tracks_of_a_long_video_do_not_depend_on_the_limit_of_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The tracks of the images are the same where all are kept, or those of more frames cut."""
-
-    def stop(stage: str, *_: object) -> None:
-        if stage == "pairs":
-            raise KeyboardInterrupt
-
+    """With little memory, the motion is read twice: to choose images, and to track points."""
     tracks = []
-    for name, held in (("once", 1 << 40), ("twice", 0)):
-        monkeypatch.setattr("colmap_av1.poses.track_stage._MAX_HELD", held)
+    for name, max_held in (("once", 1 << 40), ("twice", 0)):
+        monkeypatch.setattr("colmap_av1.poses.track_stage._MAX_HELD", max_held)
         monkeypatch.setattr(
             "colmap_av1.poses.track_stage.spread_images",
             lambda *_: np.arange(0, 60, 5, dtype=np.int32),
@@ -266,35 +264,35 @@ def test_it_is_no_matter_how_often_the_motion_of_a_long_video_is_read(
         monkeypatch.setattr("colmap_av1.poses.track_stage._CANDIDATES", 6)
         options = ReconstructOptions(max_images=10)
         with pytest.raises(KeyboardInterrupt):
-            reconstruct(SCENE, tmp_path / name, options=options, progress=stop)
+            reconstruct(SCENE, tmp_path / name, options=options, progress=interrupt_at("pairs"))
         with np.load(tmp_path / name / ".stages" / "tracks.npz") as file:
             tracks.append({part: file[part] for part in file.files})
     for part, values in tracks[0].items():
         np.testing.assert_array_equal(values, tracks[1][part])
 
 
-def test_goes_on_after_finished_stages(made: ReconstructReport, tmp_path: Path) -> None:
-    """Whatever the number of threads and wherever the video lies."""
-    files = {p: p.stat().st_mtime_ns for p in made.output.glob("[is]*/**/*.*")}
+def test_finished_stages_are_resumed(made: ReconstructReport, copy: Path, tmp_path: Path) -> None:
+    """They do not depend on the number of threads and the path of the video."""
+    files = {p: p.stat().st_mtime_ns for p in copy.glob("[is]*/**/*.*")}
     video = tmp_path / "elsewhere.mp4"
     shutil.copyfile(SCENE, video)
     match = replace(OPTIONS.match, read=ReadOptions(num_threads=1), run=RunOptions(num_threads=1))
-    again = reconstruct(video, made.output, options=replace(OPTIONS, match=match))
+    again = reconstruct(video, copy, options=replace(OPTIONS, match=match))
     assert set(again.resumed) >= {"tracks", "matches", "poses", "adjustment", "model"}
-    assert {p: p.stat().st_mtime_ns for p in made.output.glob("[is]*/**/*.*")} == files
+    assert {p: p.stat().st_mtime_ns for p in copy.glob("[is]*/**/*.*")} == files
     assert (again.num_points, again.mean_error) == (made.num_points, made.mean_error)
     assert again.warnings == made.warnings
 
 
 def contents(output: Path) -> dict[str, bytes]:
-    """What a run made, but for its report, which tells the times of its own stages."""
+    """Contents of the files of an output, except for logs, locks and JSON files with times."""
     files = (p for p in output.rglob("*") if p.is_file() and p.name != "report.json")
     kept = [p for p in files if p.suffix not in (".log", ".lock", ".json")]
     return {str(p.relative_to(output)): p.read_bytes() for p in kept}
 
 
-def test_damaged_products_are_made_again(copy: Path) -> None:
-    """Deleted, cut short, or overwritten by as many bytes."""
+def test_damaged_files_are_written_again(copy: Path) -> None:
+    """The files are deleted, truncated, or overwritten by zeros."""
     before = contents(copy)
     for name in (".stages/tracks.npz", ".stages/moving.npz", "images/frame_000006.jpg"):
         (copy / name).unlink()
@@ -307,15 +305,15 @@ def test_damaged_products_are_made_again(copy: Path) -> None:
     assert contents(copy) == before
 
 
-def test_changed_option_redoes_what_depends_on_it(
+def test_changed_option_redoes_the_stages_that_depend_on_it(
     made: ReconstructReport, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Files of others stay, and so does the old output until the new one is whole."""
+    """The old output is kept until the new one is complete, and files of others are always kept."""
     before = products(copy)
     mine = [copy / n for n in ("images/mine.png", "sparse/0/points3D.ply", "sparse/1/mine.txt")]
     mine[-1].parent.mkdir()
     for file in mine:
-        file.write_text("of a user or a trainer")
+        file.write_text("written by a user or a trainer")
     others = {file: file.read_bytes() for file in mine}
     strict = replace(OPTIONS, triangulate=TriangulateOptions(min_observations=6))
 
@@ -327,13 +325,12 @@ def test_changed_option_redoes_what_depends_on_it(
         reconstruct(SCENE, copy, options=strict, progress=interrupt)
     assert products(copy) == before | others
 
-    def full(*_: object) -> None:
+    def fail_on_full_disk(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(
-            importlib.import_module("colmap_av1.splats.reconstruct_model"), "write_model", full
-        )
+        writer = importlib.import_module("colmap_av1.splats.reconstruct_model")
+        patch.setattr(writer, "write_model", fail_on_full_disk)
         with pytest.raises(ModelError, match="No space left"):
             reconstruct(SCENE, copy, options=strict)
     assert products(copy) == before | others
@@ -347,7 +344,7 @@ def test_changed_option_redoes_what_depends_on_it(
     assert products(copy) == before | others
 
 
-def test_short_videos(encode: Encode, tmp_path: Path) -> None:
+def test_too_few_frames_are_an_error(encode: Encode, tmp_path: Path) -> None:
     one, two, three = (encode(make_frames(n), tmp_path / f"{n}.mp4") for n in (1, 2, 3))
     with pytest.raises(ImageError, match="longer video"):
         reconstruct(one, tmp_path / "out")
@@ -357,8 +354,8 @@ def test_short_videos(encode: Encode, tmp_path: Path) -> None:
         reconstruct(three, tmp_path / "out")
 
 
-def test_converted_stream_is_kept_in_the_folder(encode: Encode, tmp_path: Path) -> None:
-    """For runs that go on; here both end where images are chosen."""
+def test_converted_stream_is_kept_in_the_output(encode: Encode, tmp_path: Path) -> None:
+    """A later run uses it. Both runs here fail when images are chosen."""
     (tmp_path / "videos").mkdir()
     video = encode(make_frames(2), tmp_path / "videos" / "phone.mp4", "-c:v", "libx264")
     output, states = tmp_path / "out", []
@@ -372,7 +369,7 @@ def test_converted_stream_is_kept_in_the_folder(encode: Encode, tmp_path: Path) 
     assert [p.name for p in tmp_path.iterdir()] == ["videos", "out"]
 
 
-def test_model_of_two_images_is_none(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_model_of_two_images_is_an_error(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def map_two(*_: object, **__: object) -> tuple[int, ...]:
         return (2,)
 
@@ -383,8 +380,8 @@ def test_model_of_two_images_is_none(copy: Path, monkeypatch: pytest.MonkeyPatch
         reconstruct(SCENE, copy, options=other)
 
 
-def test_video_that_changes(copy: Path, tmp_path: Path) -> None:
-    """Tracks of one video and images of another do not come together."""
+def test_video_that_changes_during_the_run_is_an_error(copy: Path, tmp_path: Path) -> None:
+    """Otherwise, the tracks and images could come from different videos."""
     video = tmp_path / "v.mp4"
     shutil.copyfile(SCENE, video)
     shutil.rmtree(copy / "sparse")
@@ -399,9 +396,9 @@ def test_video_that_changes(copy: Path, tmp_path: Path) -> None:
     assert not list((copy / ".stages").glob("*.partial"))
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
-def test_killed_run(made: ReconstructReport, tmp_path: Path) -> None:
-    """The mapper ends with it, and the next run makes of the rest what one run makes."""
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can end a child with its parent")
+def test_killed_run_ends_its_mapper_and_is_resumed(made: ReconstructReport, tmp_path: Path) -> None:
+    """The output of both runs has the same bytes as that of a single run."""
     output = tmp_path / "out"
     words = ["--video", str(SCENE), "--output", str(output), "--every", str(EVERY)]
     words += ["--pose_tracks_per_image", "300", "--pose_spacing", "24"]
@@ -412,7 +409,7 @@ def test_killed_run(made: ReconstructReport, tmp_path: Path) -> None:
             time.sleep(0.01)
         process.kill()
     deadline = time.monotonic() + 10
-    while any(str(output).encode() in words_of(p) for p in Path("/proc").glob("[0-9]*")):
+    while any(str(output).encode() in command_line_of(p) for p in Path("/proc").glob("[0-9]*")):
         assert time.monotonic() < deadline
         time.sleep(0.01)
     again = reconstruct(SCENE, output, options=OPTIONS)
@@ -423,7 +420,8 @@ def test_killed_run(made: ReconstructReport, tmp_path: Path) -> None:
     assert not list(output.glob("**/*.partial"))
 
 
-def words_of(process: Path) -> bytes:
+def command_line_of(process: Path) -> bytes:
+    """Command line of a process in /proc; empty if it has ended."""
     try:
         return (process / "cmdline").read_bytes()
     except OSError:
@@ -431,10 +429,10 @@ def words_of(process: Path) -> bytes:
 
 
 @pytest.mark.parametrize("links", ["auto", "none"])
-def test_pictures_that_contradict_the_poses(
+def test_failed_long_range_check_adds_loop_closures(
     copy: Path, monkeypatch: pytest.MonkeyPatch, links: Literal["auto", "none"]
 ) -> None:
-    """Places seen again are linked then, unless there must be no links."""
+    """Without links, a warning suggests them instead."""
     monkeypatch.setattr("colmap_av1.poses.long_range._MAX_ERROR", 0.0)
     options = replace(OPTIONS, match=replace(OPTIONS.match, links=LinkOptions(links)))
     for name in ("far_views", "seams"):
@@ -443,39 +441,44 @@ def test_pictures_that_contradict_the_poses(
     assert found.links.looked_again == (links == "auto")
     assert (found.links.num_images > 0) == (links == "auto")
     assert found.num_registered == NUM_IMAGES
-    assert any("--links sift" in note for note in found.warnings) == (links == "none")
+    assert any("--links sift" in warning for warning in found.warnings) == (links == "none")
     assert "far_views" in reconstruct(SCENE, copy, options=options).resumed
 
 
-def test_images_that_are_left_out_are_named(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # As if those with less than the usual number of points were hidden.
+def test_warning_names_images_that_are_not_registered(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Images with fewer than 95 % of the median number of points are removed from the model.
     monkeypatch.setattr("colmap_av1.poses.mapper.FEW_SEEN", (10_000, 0.95))
     (copy / ".stages" / "adjustment.json").unlink()
     found = reconstruct(SCENE, copy, options=OPTIONS)
     written = {path.name for path in (copy / "images").iterdir()}
     assert found.num_registered == len(written) < NUM_IMAGES
     every = [f"frame_{EVERY * i:06d}.jpg" for i in range(NUM_IMAGES)]
-    missing = [name for name in every if name not in written]
-    (warning,) = [note for note in found.warnings if f"{len(missing)} of {NUM_IMAGES}" in note]
-    assert missing[0] in warning
+    not_registered = [name for name in every if name not in written]
+    share = f"{len(not_registered)} of {NUM_IMAGES}"
+    (warning,) = [warning for warning in found.warnings if share in warning]
+    assert not_registered[0] in warning
 
 
-def test_without_adjustment(made: ReconstructReport, truth: Truth, copy: Path) -> None:
-    """All images are mapped, none is resected."""
+def test_adjustment_makes_the_mapped_poses_more_accurate(
+    made: ReconstructReport, truth: Truth, copy: Path
+) -> None:
+    """Without adjustment and key images, all poses are those of the mapper."""
     mapping = replace(OPTIONS.mapping, adjust=False, key_images=False)
     plain = reconstruct(SCENE, copy, options=replace(OPTIONS, mapping=mapping))
     assert plain.num_key_images == plain.num_registered == NUM_IMAGES
-    # The lens is estimated from all images all the same.
+    # The camera is estimated from all images in both cases.
     assert cameras_of(plain.database) == cameras_of(made.database)
     mapped = read_posed_model(plain.output / ".stages" / "poses" / "0.npz").by_name
     poses = model_poses(read_model(plain.output / "sparse" / "0"), 60)
     for name, image in posed_images(read_model(plain.output / "sparse" / "0")).items():
         np.testing.assert_allclose(image.cam_from_world, mapped[name].cam_from_world, atol=1e-9)
     adjusted = model_poses(read_model(made.output / "sparse" / "0"), 60)
-    errors, before = (pose_errors(p, truth.cam_from_world) for p in (adjusted, poses))
-    # With a loss that counts errors of half a pixel nearly in full it would be 0.40 and 0.75.
-    assert errors.ate < 0.35 * before.ate
-    assert errors.rotation < 0.6 * before.rotation
+    after, before = (pose_errors(p, truth.cam_from_world) for p in (adjusted, poses))
+    # With a loss that hardly reduces errors of half a pixel, the ratios would be 0.40 and 0.75.
+    assert after.ate < 0.35 * before.ate
+    assert after.rotation < 0.6 * before.rotation
 
 
 def cameras_of(database: Path) -> list[tuple[int, bytes]]:
@@ -483,42 +486,37 @@ def cameras_of(database: Path) -> list[tuple[int, bytes]]:
         return opened.execute("SELECT model, params FROM cameras").fetchall()
 
 
-def test_folder_of_others(tmp_path: Path) -> None:
+def test_output_with_files_of_others_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("chapter 1")
     with pytest.raises(OptionError, match="not empty"):
         reconstruct(SCENE, tmp_path, options=OPTIONS)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_camera_that_only_turns(encode: Encode, tmp_path: Path) -> None:
+def test_camera_that_only_rotates_is_an_error(encode: Encode, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     wall = cv2.resize(rng.integers(0, 256, (90, 120, 3), dtype=np.uint8), (960, 720))
     camera = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
     frames = []
     for i in range(16):
         angle = np.radians(1.2 * (i - 8))
-        turn = cv2.Rodrigues(np.array([0.2 * angle, angle, 0]))[0]
-        shown = (
-            camera
-            @ turn
-            @ np.linalg.inv(camera)
-            @ np.array([[1, 0, -320], [0, 1, -240], [0, 0, 1]])
-        )
-        frames.append(cv2.warpPerspective(wall, shown, (320, 240)))
-    frames = np.stack(frames)
-    video = encode(frames, tmp_path / "flat.mp4")
-    # Also with a focal length that is far off, by which the turn looks like motion.
-    far_off = CameraOptions(camera_model="SIMPLE_RADIAL", camera_params="384,160,120,0")
-    for match in (MatchOptions(), MatchOptions(camera=far_off)):
+        rotation = cv2.Rodrigues(np.array([0.2 * angle, angle, 0]))[0]
+        centred = np.array([[1, 0, -320], [0, 1, -240], [0, 0, 1]])
+        homography = camera @ rotation @ np.linalg.inv(camera) @ centred
+        frames.append(cv2.warpPerspective(wall, homography, (320, 240)))
+    video = encode(np.stack(frames), tmp_path / "rotating.mp4")
+    # With a wrong focal length, the rotation looks like motion.
+    wrong = CameraOptions(camera_model="SIMPLE_RADIAL", camera_params="384,160,120,0")
+    for match in (MatchOptions(), MatchOptions(camera=wrong)):
         options = replace(OPTIONS_OF_ALL_FRAMES, match=match)
-        with pytest.raises(ModelError, match="depth is not observable"):
+        with pytest.raises(ModelError, match="not observable"):
             reconstruct(video, tmp_path / "out", options=options)
     assert not (tmp_path / "out" / "sparse").exists()
 
 
 @pytest.mark.parametrize("walker", [False, True])
-def test_camera_that_stands_still(encode: Encode, tmp_path: Path, walker: bool) -> None:
-    """Somebody who walks past is no motion of the camera."""
+def test_static_camera_is_an_error(encode: Encode, tmp_path: Path, walker: bool) -> None:
+    """A person who walks past is not taken for camera motion."""
     rng = np.random.default_rng(5)
     wall = cv2.resize(rng.integers(0, 256, (60, 80, 3), dtype=np.uint8), (320, 240))
     frames = np.stack([wall] * 8)
@@ -526,14 +524,14 @@ def test_camera_that_stands_still(encode: Encode, tmp_path: Path, walker: bool) 
         coat = cv2.resize(rng.integers(0, 256, (40, 20, 3), dtype=np.uint8), (60, 120))
         for i, frame in enumerate(frames):
             frame[60:180, 40 + 9 * i : 100 + 9 * i] = coat
-    video = encode(frames, tmp_path / "still.mp4")
-    with pytest.raises(ModelError, match="depth is not observable"):
+    video = encode(frames, tmp_path / "static.mp4")
+    with pytest.raises(ModelError, match="not observable"):
         reconstruct(video, tmp_path / "out", options=OPTIONS_OF_ALL_FRAMES)
     assert (tmp_path / "out" / "database.db").is_file()
     assert not (tmp_path / "out" / "sparse").exists()
 
 
-def test_command_line(
+def test_commands_print_their_results_and_write_gaussians(
     made: ReconstructReport, copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["reconstruct", "--video", str(SCENE), "--output", str(copy)]
@@ -552,11 +550,11 @@ def test_command_line(
     words += [str(tmp_path / "list.txt"), "--output", str(tmp_path / "dense")]
     assert main([*words, "--gaussians", str(tmp_path / "init")]) == 2
     assert ".ply" in capsys.readouterr().err
-    # Brush takes the last .ply of a folder, or init.ply: there is one only where it is wanted.
+    # Brush reads init.ply or the last .ply file of a folder, so there is one only if requested.
     assert main([*words, "--gaussians", str(tmp_path / "dense" / "init.ply")]) == 0
     assert [p.name for p in tmp_path.glob("dense/*.ply")] == ["init.ply"]
     printed = capsys.readouterr()
-    assert "agree with the poses" in printed.out
+    assert "agree with" in printed.out
     covered = re.search(r"coverage\t(\S+)% of the images, (\S+)% in", printed.out)
     assert covered is not None
     assert float(covered[1]) > 99 > float(covered[2]) > 80
