@@ -1,4 +1,4 @@
-"""Several videos, and photos, in one database or one model."""
+"""Several videos and photos in one database or one model."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import pytest
 from conftest import PROJECT, Encode, make_frames
 from hypothesis import given
 from hypothesis import strategies as st
+from image_sets import tracks_from
 from numpy.typing import NDArray
 from trainers import brush
 
@@ -51,11 +52,11 @@ from colmap_av1.video.decoding import decode_frames
 SCENE = PROJECT / "examples" / "scene.mp4"
 SIZE = (384, 216)
 X264 = ("-c:v", "libx264", "-crf", "14", "-g", "250")
-# Frames of the scene in the first video, in the second, and as photos.
+# Frames of the scene in the first video, in the second one, and in the photos.
 FIRST, SECOND, AS_PHOTOS = range(16), range(16, 32), (14, 17, 20)
-# As many features as these small pictures need.
+# Fewer features than by default suffice for these small pictures.
 QUICK = MatchOptions(images=ImageOptions(every=2), links=LinkOptions(max_link_features=400))
-NUM_IMAGES = 8  # of each half
+NUM_IMAGES = 8  # in each half
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,7 @@ def pictures() -> NDArray[np.uint8]:
 def halves(
     pictures: NDArray[np.uint8], encode: Encode, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path]:
-    """A clip in two parts."""
+    """A clip in two halves."""
     folder = tmp_path_factory.mktemp("halves")
     first = encode(pictures[FIRST.start : FIRST.stop], folder / "walk in.mp4")
     return first, encode(pictures[SECOND.start : SECOND.stop], folder / "back.mp4")
@@ -76,7 +77,7 @@ def halves(
 
 @pytest.fixture(scope="module")
 def photos(pictures: NDArray[np.uint8], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Some pictures of the clip, as files of another size."""
+    """Some frames of the clip as photos of another size."""
     folder = tmp_path_factory.mktemp("album") / "photos"
     (folder / "more").mkdir(parents=True)
     for number, frame in enumerate(AS_PHOTOS):
@@ -86,14 +87,14 @@ def photos(pictures: NDArray[np.uint8], tmp_path_factory: pytest.TempPathFactory
     return folder
 
 
-def test_two_videos_and_photos_are_one_database(
+def test_match_writes_videos_and_photos_to_one_database(
     halves: tuple[Path, Path],
     photos: Path,
     pictures: NDArray[np.uint8],
     encode: Encode,
     tmp_path: Path,
 ) -> None:
-    """One of the videos is not AV1."""
+    """One of the videos is H.264 instead of AV1."""
     images = tmp_path / "images"
     phone = encode(pictures[SECOND.start : SECOND.stop], tmp_path / "back.mp4", *X264)
     videos = (halves[0], phone)
@@ -105,14 +106,14 @@ def test_two_videos_and_photos_are_one_database(
     assert report.links.parts == report.links.unlinked_photos == ()
     assert report.warnings == ()
     listed = read_images(tmp_path / "a.db")
-    of_photos = ["IMG.0.JPG", "more/IMG.1.jpg", "more/IMG.2.jpg"]
+    photo_names = ["IMG.0.JPG", "more/IMG.1.jpg", "more/IMG.2.jpg"]
     assert [image.name for image in listed] == [
         *(f"walk_in/frame_{2 * i:06d}.png" for i in range(NUM_IMAGES)),
         *(f"back/frame_{2 * i:06d}.png" for i in range(NUM_IMAGES)),
-        *(f"photos/{name}" for name in of_photos),
+        *(f"photos/{name}" for name in photo_names),
     ]
     assert all((images / image.name).is_file() for image in listed)
-    for name in of_photos:
+    for name in photo_names:
         assert (images / "photos" / name).read_bytes() == (photos / name).read_bytes()
     by_camera = {i.camera_id: (i.width, i.height) for i in listed}
     assert list(by_camera.values()) == [SIZE, SIZE, (480, 270)]
@@ -120,14 +121,14 @@ def test_two_videos_and_photos_are_one_database(
     assert check_database(tmp_path / "a.db").num_connected_images == report.num_images
 
 
-def test_videos_share_a_camera_where_they_are_told_to(
+def test_videos_share_a_camera_if_requested(
     halves: tuple[Path, Path], pictures: NDArray[np.uint8], encode: Encode, tmp_path: Path
 ) -> None:
     one = MatchOptions(camera=CameraOptions(single_camera=True))
     few = replace(one, images=ImageOptions(every=3), links=LinkOptions(links="none"))
     match(tmp_path / "a.db", halves, options=few)
     assert len(read_cameras(tmp_path / "a.db")) == 1
-    # Once more into the same rows.
+    # A second run replaces the matches, and keeps the images with their camera.
     listed = read_images(tmp_path / "a.db")
     again = replace(few, camera=CameraOptions(), on_existing="replace")
     match(tmp_path / "a.db", halves, options=again)
@@ -141,10 +142,10 @@ def test_videos_share_a_camera_where_they_are_told_to(
     assert not (tmp_path / "b.db").exists()
 
 
-def test_videos_of_different_scenes_are_told(
+def test_videos_of_different_scenes_are_reported(
     halves: tuple[Path, Path], clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = [*("match", "--database", str(tmp_path / "a.db"), "--quiet")]
+    words = ["match", "--database", str(tmp_path / "a.db"), "--quiet"]
     words += ["--every", "2", "--max_link_features", "400"]
     assert main([*words, "--video", str(halves[0]), "--video", str(clip)]) == 0
     err = capsys.readouterr().err
@@ -159,7 +160,7 @@ def test_videos_of_different_scenes_are_told(
     assert any("links none" in warning for warning in report.warnings)
 
 
-def test_a_photo_of_something_else_is_told(
+def test_photo_of_another_scene_is_reported(
     halves: tuple[Path, Path], photos: Path, tmp_path: Path
 ) -> None:
     album = tmp_path / "album"
@@ -168,11 +169,11 @@ def test_a_photo_of_something_else_is_told(
     report = match(tmp_path / "a.db", halves[0], photos=album, options=QUICK)
     assert report.links.unlinked_photos == ("album/cat.png",)
     assert any("'album/cat.png'" in warning for warning in report.warnings)
-    # A lone video's images keep their names.
+    # The images of a single video have no folder in their names.
     assert read_images(tmp_path / "a.db")[0].name == "frame_000000.png"
 
 
-def test_one_video_twice_is_refused(halves: tuple[Path, Path], tmp_path: Path) -> None:
+def test_same_video_twice_is_an_error(halves: tuple[Path, Path], tmp_path: Path) -> None:
     copy = tmp_path / "copy.mp4"
     shutil.copyfile(halves[0], copy)
     for other in (halves[0], copy, os.path.relpath(halves[0])):
@@ -181,10 +182,10 @@ def test_one_video_twice_is_refused(halves: tuple[Path, Path], tmp_path: Path) -
     assert not (tmp_path / "a.db").exists()
 
 
-def test_two_encodings_of_a_video_are_told(
+def test_two_encodings_of_a_video_are_reported(
     halves: tuple[Path, Path], pictures: NDArray[np.uint8], encode: Encode, tmp_path: Path
 ) -> None:
-    """Of other bytes, size and length."""
+    """They differ in the picture size and in the number of frames."""
     smaller = [cv2.resize(image, (288, 162)) for image in pictures[2 : FIRST.stop]]
     again = encode(np.array(smaller), tmp_path / "again.mp4")
     report = match(tmp_path / "a.db", [halves[0], again], options=QUICK)
@@ -203,7 +204,7 @@ def test_two_encodings_of_a_video_are_told(
         ("cut short", r"bad\.jpg"),
     ],
 )
-def test_photos_that_cannot_be_read(
+def test_unusable_photos_are_errors(
     kind: str, message: str, halves: tuple[Path, Path], photos: Path, tmp_path: Path
 ) -> None:
     album = tmp_path / "album"
@@ -221,13 +222,15 @@ def test_photos_that_cannot_be_read(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["album"] * album.exists()
 
 
-def test_another_file_with_a_photos_name_is_kept(
+def test_another_file_with_the_name_of_a_photo_is_kept(
     halves: tuple[Path, Path], photos: Path, tmp_path: Path
 ) -> None:
-    (tmp_path / "images" / "photos").mkdir(parents=True)
-    (tmp_path / "images" / "photos" / "IMG.0.JPG").write_bytes(b"mine")
+    mine = tmp_path / "images" / "photos" / "IMG.0.JPG"
+    mine.parent.mkdir(parents=True)
+    mine.write_bytes(b"mine")
     with pytest.raises(ImageError, match="another file"):
         match(tmp_path / "a.db", halves[0], photos=photos, image_path=tmp_path / "images")
+    assert mine.read_bytes() == b"mine"
 
 
 @pytest.mark.parametrize(
@@ -238,16 +241,16 @@ def test_another_file_with_a_photos_name_is_kept(
         (MatchOptions(links=LinkOptions(links="none")), "links"),
     ],
 )
-def test_options_for_one_video(
+def test_options_that_do_not_suit_videos_and_photos_are_errors(
     options: MatchOptions, message: str, halves: tuple[Path, Path], photos: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(OptionError, match=message):
         match(tmp_path / "a.db", halves, photos=photos, options=options)
 
 
-def test_a_database_of_other_images_is_refused(halves: tuple[Path, Path], tmp_path: Path) -> None:
-    match(tmp_path / "a.db", halves[0])
-    again = replace(MatchOptions(), on_existing="append")
+def test_database_of_other_images_is_an_error(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    match(tmp_path / "a.db", halves[0], options=QUICK)
+    again = replace(QUICK, on_existing="append")
     with pytest.raises(DatabaseError, match="walk_in, back"):
         match(tmp_path / "a.db", halves, options=again)
 
@@ -261,17 +264,17 @@ def test_a_database_of_other_images_is_refused(halves: tuple[Path, Path], tmp_pa
         (["/x/a", "/x"], ["a", "x"]),
     ],
 )
-def test_labels_tell_videos_apart(places: list[str], labels: list[str]) -> None:
+def test_labels_of_videos_differ(places: list[str], labels: list[str]) -> None:
     assert labels_of(places) == labels
 
 
-def test_names_that_only_signs_tell_apart_are_refused() -> None:
-    with pytest.raises(OptionError, match="rename one"):
+def test_names_that_differ_only_in_special_characters_are_an_error() -> None:
+    with pytest.raises(OptionError, match="rename"):
         labels_of(["/x/a b", "/x/a-b", "/x/a+b"])
 
 
 @given(st.lists(st.text(min_size=1, max_size=4), min_size=1, max_size=4))
-def test_labels_are_plain_and_different(names: list[str]) -> None:
+def test_labels_differ_and_have_no_dots_slashes_or_spaces(names: list[str]) -> None:
     try:
         labels = labels_of([f"/x/{name.replace('/', '_')}" for name in names])
     except ColmapAv1Error:
@@ -280,23 +283,13 @@ def test_labels_are_plain_and_different(names: list[str]) -> None:
     assert not any(set(label) & set("./ ") for label in labels)
 
 
-def some_tracks(num_frames: int, size: tuple[int, int]) -> Tracks:
-    """A track through all frames, and one through the last two."""
-    frame = np.array([*range(num_frames), num_frames - 2, num_frames - 1], np.int32)
-    return Tracks(
-        *(num_frames, *size, np.array([0, num_frames, num_frames + 2]), frame),
-        xy=np.random.default_rng(num_frames).random((len(frame), 2), np.float32),
-        sigma=np.ones(len(frame), np.float32),
-        confirmed=np.zeros(len(frame), np.bool_),
-    )
-
-
-def test_frames_are_counted_through() -> None:
-    one, two = some_tracks(5, (64, 48)), some_tracks(3, (32, 80))
-    row = Tracks.in_sequence([one, two], 9)
-    assert (row.num_frames, row.width, row.height) == (9, 64, 80)
-    assert row.offsets.tolist() == [0, 5, 7, 10, 12]
-    assert row.frame.tolist() == [0, 1, 2, 3, 4, 3, 4, 5, 6, 7, 6, 7]
+def test_frames_of_several_videos_are_numbered_consecutively() -> None:
+    one = replace(tracks_from([[0, 1, 2, 3, 4], [3, 4]], 5), width=64, height=48)
+    two = replace(tracks_from([[0, 1, 2], [1, 2]], 3), width=32, height=80)
+    both = Tracks.in_sequence([one, two], 9)
+    assert (both.num_frames, both.width, both.height) == (9, 64, 80)
+    assert both.offsets.tolist() == [0, 5, 7, 10, 12]
+    assert both.frame.tolist() == [0, 1, 2, 3, 4, 3, 4, 5, 6, 7, 6, 7]
     assert Tracks.in_sequence([one], 5) is one
     chosen = [ChosenImages(["0.png", "4.png"], np.array([0, 4], np.int32))]
     chosen.append(ChosenImages(["2.png"], np.array([2], np.int32)))
@@ -309,7 +302,7 @@ def test_frames_are_counted_through() -> None:
     assert (image_set.num_sequences, image_set.num_frames) == (3, 9)
 
 
-def test_two_videos_and_photos_are_one_model(
+def test_reconstruct_joins_videos_and_photos_in_one_model(
     halves: tuple[Path, Path], photos: Path, tmp_path: Path
 ) -> None:
     options = ReconstructOptions(match=QUICK)
@@ -324,11 +317,15 @@ def test_two_videos_and_photos_are_one_model(
         camera = model.cameras[image.camera_id]
         assert picture.shape[1::-1] == (camera.width, camera.height)
         assert image.name.count(".") == 1
-    seen_by = {
+    observed_by = {
         frozenset(model.images[e.image_id].name.split("/")[0] for e in point.track.elements)
         for point in model.points3D.values()
     }
-    assert {frozenset({"walk_in"}), frozenset({"back"}), frozenset({"walk_in", "back"})} <= seen_by
+    assert {
+        frozenset({"walk_in"}),
+        frozenset({"back"}),
+        frozenset({"walk_in", "back"}),
+    } <= observed_by
 
     adjusted = read_posed_model(made.output / ".stages" / "adjusted.npz")
     posed = tmp_path / "posed"
@@ -344,7 +341,7 @@ def test_two_videos_and_photos_are_one_model(
     assert {"tracks_walk_in", "tracks_back", "matches", "poses", "model"} <= set(resumed.resumed)
 
 
-def test_what_nothing_connects_becomes_models_with_folders_of_their_own(
+def test_unconnected_videos_become_models_in_separate_folders(
     halves: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     apart = ReconstructOptions(match=MatchOptions(links=LinkOptions(links="none")))
@@ -354,15 +351,17 @@ def test_what_nothing_connects_becomes_models_with_folders_of_their_own(
     assert sorted(made.registered.values()) == [0, len(FIRST)]
     assert further.output == tmp_path / "out" / "model_1"
     assert any("'model_1'" in warning for warning in made.warnings)
-    shown = set()
+    registered = set()
     for folder in (made.output, further.output):
         model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
         names = {image.name for image in model.images.values()}
         assert all((folder / "images" / name).is_file() for name in names)
-        shown |= names
-    assert len(shown) == made.num_images
+        registered |= names
+    assert len(registered) == made.num_images
     assert model.num_points3D() == further.num_points > 500
-    taken = brush(made.output)  # either of the two, as they are of one size, with its own pictures
+    # The models have the same number of images, so a trainer may read either of them. It must find
+    # the pictures of the model that it reads.
+    taken = brush(made.output)
     folder = taken.model.parents[1]
     assert set(taken.pictures.values()) == {*(folder / "images").rglob("*.jpg")}
     assert brush(further.output).model == further.output / "sparse" / "0"
@@ -371,13 +370,13 @@ def test_what_nothing_connects_becomes_models_with_folders_of_their_own(
     assert "model" in again.resumed
     assert again.other_models == made.other_models
 
-    # A mapper that begins once more among images that it has placed makes no further model.
-    def twice(database: Path, output: Path, *rest: Any, **how: Any) -> tuple[int, ...]:
+    # If the mapper makes another model of images that are already registered, it is discarded.
+    def map_twice(database: Path, output: Path, *rest: Any, **how: Any) -> tuple[int, ...]:
         (size,) = map_poses(database, output, *rest, **how)
         shutil.copytree(output / "0", output / "1")
         return size, size
 
-    monkeypatch.setattr("colmap_av1.poses.pose_stages.map_poses", twice)
+    monkeypatch.setattr("colmap_av1.poses.pose_stages.map_poses", map_twice)
     alone = reconstruct(halves[0], tmp_path / "out", options=ReconstructOptions(match=QUICK))
     assert alone.other_models == ()
     assert alone.warnings == ()
