@@ -1,4 +1,4 @@
-"""Batches on this machine: what is there afterwards, and what a second run does."""
+"""Batches on this machine: their outputs, second runs and errors."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from batch_output import files_of, rows_of
+from batch_output import PACKAGES, files_of, rows_of
 from conftest import PROJECT
 
-import colmap_av1
 from colmap_av1 import (
     BatchOptions,
     DensifyOptions,
@@ -32,8 +31,6 @@ from colmap_av1 import (
 from colmap_av1.batch.run import Counts
 from colmap_av1.cli import main
 
-# The folder that the package under test is installed in.
-PACKAGES = Path(colmap_av1.__file__).parents[1]
 ONCE = BatchOptions(retries=0)
 SMALL = MatchOptions(
     images=ImageOptions(image_name="%03d.jpg"), verify=VerifyOptions(verify="pairs")
@@ -41,13 +38,17 @@ SMALL = MatchOptions(
 DONE = ["a/clip0", "a/clip2", "a/clip4", "b/clip1", "b/clip3", "b/clip5"]
 
 
-def test_every_video_ends_done_or_named(clips: Path, tmp_path: Path) -> None:
-    seen: list[int] = []
+def test_every_video_is_done_or_reported_as_failed(clips: Path, tmp_path: Path) -> None:
+    progress: list[int] = []
+
+    def on_progress(counts: Counts, _: object) -> None:
+        progress.append(counts.ended)
+
     out = tmp_path / "out"
-    report = run_batch(clips, out, SMALL, on_progress=lambda counts, _: seen.append(counts.ended))
+    report = run_batch(clips, out, SMALL, on_progress=on_progress)
     assert (report.num_videos, report.num_done, report.num_kept) == (8, 6, 0)
     assert report.failed == {"damaged": 1, "unreadable": 1}
-    assert seen == list(range(9))
+    assert progress == list(range(9))
     rows = rows_of(out)
     paths = sorted(p.relative_to(clips).as_posix() for p in clips.rglob("*.mp4"))
     assert [f"{row['name']}.mp4" for row in rows] == paths
@@ -68,19 +69,19 @@ def test_every_video_ends_done_or_named(clips: Path, tmp_path: Path) -> None:
     assert [p.name for p in (out / ".batch").iterdir()] == ["batch.lock"]
 
 
-def test_a_second_run_does_what_has_changed(clips: Path, tmp_path: Path) -> None:
+def test_second_run_processes_changed_and_failed_videos(clips: Path, tmp_path: Path) -> None:
     videos = tmp_path / "videos"
     videos.mkdir()
     for name in ("clip0", "clip2", "clip4", "damaged"):
         shutil.copy2(clips / "a" / f"{name}.mp4", videos)
     out = tmp_path / "out"
     assert run_batch(videos, out, ReadOptions(), options=ONCE).num_done == 3
-    before, first = files_of(out), (out / "clip0" / "report.json").stat()
+    before, first = files_of(out), (out / "clip0" / "report.json").stat().st_mtime_ns
     threads = ReadOptions(num_threads=2)  # has no effect on the result
     again = run_batch(videos, out, threads, options=ONCE)
     assert (again.num_done, again.num_kept, again.failed) == (3, 3, {"damaged": 1})
     assert files_of(out) == before
-    assert (out / "clip0" / "report.json").stat() == first
+    assert (out / "clip0" / "report.json").stat().st_mtime_ns == first
 
     shutil.copyfile(clips / "a" / "clip4.mp4", videos / "clip2.mp4")
     (out / "clip4" / "report.json").write_text('{"key": ')
@@ -88,11 +89,12 @@ def test_a_second_run_does_what_has_changed(clips: Path, tmp_path: Path) -> None
     changed = run_batch(videos, out, ReadOptions(), options=ONCE)
     assert (changed.num_done, changed.num_kept) == (2, 1)
     assert rows_of(out)[1]["frames"] == "7"
-    assert changed.failed == {"damaged": 1, "unfit": 1}  # clip4 might be of others
+    # Without a valid report, the folder of clip4 could contain files of others.
+    assert changed.failed == {"damaged": 1, "unfit": 1}
 
 
-def test_shards_share_an_output(clips: Path, tmp_path: Path) -> None:
-    """Two at once, as in an array of jobs."""
+def test_shards_write_to_one_output(clips: Path, tmp_path: Path) -> None:
+    """Two shards run at the same time, as in a job array."""
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     run_batch(clips / "a", whole, ReadOptions(), options=ONCE)
     command = [sys.executable, "-m", "colmap_av1", "batch", "--task", "info", "--quiet"]
@@ -107,13 +109,14 @@ def test_shards_share_an_output(clips: Path, tmp_path: Path) -> None:
         )
         for i in (1, 2)
     ]
-    assert sorted(shard.wait() for shard in shards) == [0, 1]  # one has the damaged video
+    # One shard has the damaged video.
+    assert sorted(shard.wait() for shard in shards) == [0, 1]
     assert files_of(parts) == files_of(whole)
     rows = [rows_of(parts, f"batch-{i}-of-2.csv") for i in (1, 2)]
     assert [rows[i % 2][i // 2] for i in range(4)] == rows_of(whole)
 
 
-def test_files_of_users_stay(clips: Path, tmp_path: Path) -> None:
+def test_files_of_users_are_kept(clips: Path, tmp_path: Path) -> None:
     out, video = tmp_path / "out", clips / "a" / "clip0.mp4"
     (out / "clip2").mkdir(parents=True)
     users = [out / "clip2" / "mine.txt", out / "clip4"]
@@ -131,7 +134,7 @@ def test_files_of_users_stay(clips: Path, tmp_path: Path) -> None:
     assert run_batch(video, out, strict, options=ONCE).num_kept == 1
 
 
-def test_another_task_in_one_output_is_refused(clips: Path, tmp_path: Path) -> None:
+def test_output_with_another_task_is_an_error(clips: Path, tmp_path: Path) -> None:
     out, video = tmp_path / "out", clips / "a" / "clip0.mp4"
     run_batch(video, out, ReadOptions(), options=ONCE)
     before = files_of(out)
@@ -151,7 +154,7 @@ def test_another_task_in_one_output_is_refused(clips: Path, tmp_path: Path) -> N
         ("batch-1-of-1.csv", "my,table"),
     ],
 )
-def test_files_of_others_with_the_names_of_rows_stay(
+def test_files_of_others_with_the_name_of_a_table_are_kept(
     name: str, content: str, clips: Path, tmp_path: Path
 ) -> None:
     video, options = clips / "a" / "clip0.mp4", ONCE
@@ -164,7 +167,7 @@ def test_files_of_others_with_the_names_of_rows_stay(
     assert not (tmp_path / "clip0").exists()
 
 
-def test_damaged_rows_are_written_anew(clips: Path, tmp_path: Path) -> None:
+def test_damaged_tables_are_replaced(clips: Path, tmp_path: Path) -> None:
     video = clips / "a" / "clip0.mp4"
     run_batch(video, tmp_path, ReadOptions(), options=ONCE)
     rows = rows_of(tmp_path)
@@ -176,8 +179,8 @@ def test_damaged_rows_are_written_anew(clips: Path, tmp_path: Path) -> None:
     write_page(tmp_path)
 
 
-def test_what_was_stopped_while_it_was_written(clips: Path, tmp_path: Path) -> None:
-    """Files that an interrupted run had put into the folder of a video are replaced."""
+def test_unfinished_folder_of_a_video_is_completed(clips: Path, tmp_path: Path) -> None:
+    """Files that an interrupted run wrote are replaced or removed, and files of users are kept."""
     out, video = tmp_path / "out", clips / "a" / "clip0.mp4"
     run_batch(video, out, SMALL, options=ONCE)
     whole = files_of(out)
@@ -185,15 +188,15 @@ def test_what_was_stopped_while_it_was_written(clips: Path, tmp_path: Path) -> N
     mine.write_text("mine")
     (out / "clip0" / ".unfinished").write_text(json.dumps(["stale", *(n[6:] for n in whole)]))
     (out / "clip0" / "report.json").unlink()
-    (out / "clip0" / "stale").write_text("of the run before")
+    (out / "clip0" / "stale").write_text("written by the interrupted run")
     assert run_batch(video, out, SMALL, options=ONCE).num_done == 1
     assert mine.read_text() == "mine"
     mine.unlink()
     assert files_of(out) == whole
 
 
-def test_a_place_that_cannot_be_written(clips: Path, tmp_path: Path) -> None:
-    """One folder of the output cannot be made: the others are."""
+def test_folder_that_cannot_be_created_fails_only_its_video(clips: Path, tmp_path: Path) -> None:
+    """An output that cannot be created is an error of the batch."""
     videos, out = tmp_path / "videos", tmp_path / "out"
     for folder in ("a", "b"):
         (videos / folder).mkdir(parents=True)
@@ -206,8 +209,8 @@ def test_a_place_that_cannot_be_written(clips: Path, tmp_path: Path) -> None:
         run_batch(videos, out / "a", ReadOptions())
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="names are text elsewhere")
-def test_names_that_are_no_text(clips: Path, tmp_path: Path) -> None:
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not allow such names")
+def test_names_of_videos_need_not_be_utf_8(clips: Path, tmp_path: Path) -> None:
     videos = tmp_path / "videos"
     videos.mkdir()
     name = os.fsdecode(b"caf\xe9, \xc3\xa9.mp4")
@@ -219,7 +222,7 @@ def test_names_that_are_no_text(clips: Path, tmp_path: Path) -> None:
     assert main(["batch", "report", "--output", str(out), "--quiet"]) == 0
 
 
-def test_options_that_cannot_work(clips: Path, tmp_path: Path) -> None:
+def test_invalid_options_are_errors(clips: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(OptionError, match="keep_stream"):
         run_batch(clips, out, MatchOptions(keep_stream="x.mp4"))
@@ -234,7 +237,9 @@ def test_options_that_cannot_work(clips: Path, tmp_path: Path) -> None:
     assert not out.exists()
 
 
-def test_the_command(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_prints_counts_and_sets_its_exit_status(
+    clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = str(tmp_path / "out")
     one = ["batch", "--inputs", str(clips / "a" / "clip0.mp4"), "--output", out]
     other = ["batch", "--inputs", str(clips), "--output", str(tmp_path / "other")]
@@ -253,7 +258,7 @@ def test_the_command(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
 @pytest.mark.parametrize(
     ("shard", "refused"), [(None, [None, "1/2"]), ("1/2", [None, "1/2", "1/3", "3/3"])]
 )
-def test_one_batch_at_a_time(
+def test_second_batch_at_the_same_time_is_an_error(
     shard: str | None, refused: list[str | None], clips: Path, tmp_path: Path
 ) -> None:
     out, video = tmp_path / "out", clips / "a" / "clip0.mp4"
@@ -273,15 +278,14 @@ def test_one_batch_at_a_time(
         run_batch(video, out, ReadOptions(), options=BatchOptions(shard=other))
 
 
-def test_a_video_without_a_model(clips: Path, tmp_path: Path) -> None:
+def test_video_without_a_model_fails(clips: Path, tmp_path: Path) -> None:
     video, out = clips / "a" / "clip0.mp4", tmp_path / "out"
     report = run_batch(video, out, DensifyOptions(), models=tmp_path, options=ONCE)
     assert report.failed == {"no model": 1}
 
 
 @pytest.mark.slow
-def test_scenes_and_dense_scenes(tmp_path: Path) -> None:
-    """The models that one batch makes are made dense by another."""
+def test_batch_densifies_the_models_of_another_batch(tmp_path: Path) -> None:
     video = PROJECT / "examples" / "scene.mp4"
     scenes, dense = tmp_path / "scenes", tmp_path / "dense"
     options = ReconstructOptions(match=MatchOptions(images=ImageOptions(every=5)))
@@ -305,7 +309,7 @@ def test_scenes_and_dense_scenes(tmp_path: Path) -> None:
     assert (changed.num_done, changed.num_kept) == (0, 0)
 
 
-def test_secrets_of_signed_urls_are_not_kept(
+def test_secrets_of_signed_urls_are_neither_printed_nor_written(
     clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fsspec = pytest.importorskip("fsspec", reason="needs the extra remote")
@@ -321,11 +325,12 @@ def test_secrets_of_signed_urls_are_not_kept(
     out = tmp_path / "out"
     assert run_batch(clips / "a" / "clip0.mp4", out, masked, options=ONCE).num_done == 0
     words = ["batch", "--inputs", str(videos), "--output", output, "--task", "match"]
-    assert main(words) == 2  # it holds another task
+    # The output has another task, which is an error that names the output.
+    assert main(words) == 2
     printed = capsys.readouterr()
-    kept = [store.cat_file(path) for path in store.find("/signed/out?sig=SECRET")]
-    kept += [path.read_bytes() for path in out.rglob("*") if path.is_file()]
-    shown = f"{report} {page} {printed} {kept}"
-    assert "memory://signed/v.mp4" in shown
-    assert "SECRET" not in shown
+    written = [store.cat_file(path) for path in store.find("/signed/out?sig=SECRET")]
+    written += [path.read_bytes() for path in out.rglob("*") if path.is_file()]
+    everything = f"{report} {page} {printed} {written}"
+    assert "memory://signed/v.mp4" in everything
+    assert "SECRET" not in everything
     store.rm("/signed", recursive=True)

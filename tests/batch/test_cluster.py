@@ -1,4 +1,4 @@
-"""Batches by Ray: the same rows and bytes as on one machine, and a node that is lost."""
+"""Batches on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -10,25 +10,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from batch_output import files_of, rows_of, workers_of
+from batch_output import PACKAGES, files_of, rows_of, workers_of
 
-import colmap_av1
 from colmap_av1 import BatchOptions, OptionError, ReadOptions, run_batch
 from colmap_av1.batch.run import Counts
 from colmap_av1.util.signals import handlers_kept
 
-# The folder that the package under test is installed in.
-PACKAGES = Path(colmap_av1.__file__).parents[1]
 ray: Any = pytest.importorskip("ray", reason="needs ray: pip install '.[cluster]'")
 
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A Ray of two nodes on this machine, of one core each."""
-    from ray.cluster_utils import Cluster  # noqa: PLC0415 - where there is a Ray
+    """A Ray cluster of two nodes on this machine, with one core each."""
+    from ray.cluster_utils import Cluster  # noqa: PLC0415 - only if Ray is installed
 
     with pytest.MonkeyPatch.context() as patch, handlers_kept():
-        # Not where the checkout, that holds no compiled part, would be imported.
+        # In the checkout, its package without the compiled part would hide the installed one.
         patch.chdir(tmp_path_factory.mktemp("cluster"))
         patch.setenv("PYTHONPATH", str(PACKAGES), prepend=os.pathsep)
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
@@ -40,7 +37,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 def ray_workers() -> list[int]:
-    """Processes in which Ray runs tasks."""
+    """Ids of the processes in which Ray processes videos."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -51,9 +48,10 @@ def ray_workers() -> list[int]:
     return found
 
 
-def test_a_cluster_that_loses_processes_and_a_node(
+def test_batch_survives_the_loss_of_processes_and_a_node(
     cluster: Any, clips: Path, tmp_path: Path
 ) -> None:
+    """The rows and files have the same bytes as those of a batch on this machine."""
     local, out = tmp_path / "local", tmp_path / "out"
     run_batch(clips, local, ReadOptions())
     options = BatchOptions(engine="ray", address=cluster.address, retries=99)
@@ -77,7 +75,7 @@ def test_a_cluster_that_loses_processes_and_a_node(
     assert len(cluster.worker_nodes) == 0
 
 
-def test_no_cluster(clips: Path, tmp_path: Path) -> None:
+def test_missing_cluster_is_an_error(clips: Path, tmp_path: Path) -> None:
     options = BatchOptions(engine="ray", address="127.0.0.1:1")
     with pytest.raises(OptionError, match="127"):
         run_batch(clips, tmp_path / "out", ReadOptions(), options=options)

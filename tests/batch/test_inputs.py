@@ -1,4 +1,4 @@
-"""Lists, patterns and folders of videos, and their names."""
+"""Inputs of batches: lists, patterns, folders and URLs of videos, and their names."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ def names(*inputs: str | Path) -> list[str]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with some files that are called videos."""
+    """A folder of files, some of which have the names of videos."""
     for name in ("b.mp4", "a.webm", "sub/c.v1.MP4", "sub/notes.txt", ".hidden.mp4", ".h/d.mp4"):
         (tmp_path / "videos" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "videos" / name).write_bytes(name.encode())
     return tmp_path / "videos"
 
 
-def test_folders_and_patterns(folder: Path) -> None:
+def test_folders_and_patterns_are_expanded(folder: Path) -> None:
     assert names(folder) == ["a", "b", "sub/c.v1"]
     assert names(f"{folder}/*.mp4") == ["b"]
     assert names(f"{folder}/**/*.[mM][pP]4") == ["b", "sub/c.v1"]
     assert names(folder / "b.mp4", folder / "sub" / "c.v1.MP4") == ["b", "c.v1"]
 
 
-def test_lists(folder: Path) -> None:
+def test_lists_have_paths_urls_and_names(folder: Path) -> None:
     videos = folder.parent / "videos.txt"
     lines = ["videos/sub/c.v1.MP4", f"{folder}/b.mp4\tscene/first", "", "../x/e.mp4\r"]
     videos.write_text("\n".join([*lines, "https://host/f.mp4?key=1", "s3://bucket/dir/g.mkv"]))
@@ -49,7 +49,7 @@ def test_lists(folder: Path) -> None:
     assert found[4] == Video("g", "s3://bucket/dir/g.mkv")
 
 
-def test_a_list_with_a_mark_of_byte_order(folder: Path) -> None:
+def test_byte_order_mark_of_a_list_is_ignored(folder: Path) -> None:
     videos = folder.parent / "videos.txt"
     videos.write_text("videos/b.mp4\nvideos/a.webm\n", encoding="utf-8-sig")
     assert names(videos) == ["videos/b", "videos/a"]
@@ -67,7 +67,7 @@ def test_a_list_with_a_mark_of_byte_order(folder: Path) -> None:
         ("gopher9://x/y.mp4", "gopher9"),
     ],
 )
-def test_no_videos(given: str, message: str, tmp_path: Path) -> None:
+def test_inputs_without_videos_are_errors(given: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "empty.txt").write_text("\n\n")
     (tmp_path / "empty").mkdir()
     (tmp_path / "binary").write_bytes(bytes(100))
@@ -77,7 +77,7 @@ def test_no_videos(given: str, message: str, tmp_path: Path) -> None:
         names(given if "://" in given else tmp_path / given)
 
 
-def test_an_output_among_the_inputs(folder: Path) -> None:
+def test_output_inside_the_inputs_is_an_error(folder: Path) -> None:
     with pytest.raises(OptionError, match="searched"):
         run_batch(folder, folder / "out", ReadOptions())
 
@@ -95,7 +95,7 @@ def test_an_output_among_the_inputs(folder: Path) -> None:
         ("x.mp4\tbatch-1-of-2.csv", "name"),
     ],
 )
-def test_names_that_clash(lines: str, message: str, tmp_path: Path) -> None:
+def test_names_that_conflict_are_errors(lines: str, message: str, tmp_path: Path) -> None:
     videos = tmp_path / "list"
     videos.write_text(lines)
     with pytest.raises(OptionError, match=message):
@@ -103,12 +103,14 @@ def test_names_that_clash(lines: str, message: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shard", ["0/2", "3/2", "1", "1/0", "a/b", "-1/2"])
-def test_bad_shards(shard: str) -> None:
+def test_invalid_shards_are_errors(shard: str) -> None:
     with pytest.raises(OptionError, match="I/N"):
         BatchOptions(shard=shard)
 
 
-class _Hangs(http.server.BaseHTTPRequestHandler):
+class _Failing(http.server.BaseHTTPRequestHandler):
+    """Stops in the middle of /hangs.mp4, and answers all other paths with the status in them."""
+
     def do_HEAD(self) -> None:
         if self.path != "/hangs.mp4":
             self.send_error(int(self.path[1:4]))
@@ -131,8 +133,8 @@ class _Hangs(http.server.BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server() -> Iterator[str]:
-    """A web server that starts to answer and then says no more."""
-    web = http.server.ThreadingHTTPServer(("127.0.0.1", 0), _Hangs)
+    """The URL of a web server whose requests hang or fail."""
+    web = http.server.ThreadingHTTPServer(("127.0.0.1", 0), _Failing)
     web.daemon_threads = True
     threading.Thread(target=web.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{web.server_port}"
@@ -140,7 +142,7 @@ def server() -> Iterator[str]:
     web.server_close()
 
 
-def test_a_url_that_hangs(server: str, tmp_path: Path) -> None:
+def test_hanging_download_fails_after_the_stall_time(server: str, tmp_path: Path) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra remote")
     videos = tmp_path / "list"
     videos.write_text(f"{server}/hangs.mp4\n{server}/404.mp4\n")
@@ -152,7 +154,8 @@ def test_a_url_that_hangs(server: str, tmp_path: Path) -> None:
     assert "no such file" in text
 
 
-def test_a_server_that_is_out_of_order_has_not_lost_the_file(server: str, tmp_path: Path) -> None:
+def test_server_errors_are_not_reported_as_missing_files(server: str, tmp_path: Path) -> None:
+    """They may be temporary, so the videos are retried."""
     pytest.importorskip("aiohttp", reason="needs the extra remote")
     videos = tmp_path / "list"
     addresses = [f"{server}/503.mp4", f"{server}/403.mp4?sig=SECRET", "http://127.0.0.1:1/x.mp4"]

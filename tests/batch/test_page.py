@@ -1,4 +1,4 @@
-"""The page of a batch: one file that needs no other, with all failures and numbers."""
+"""The page of a batch: one file without references, with all failures and figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ JPEG = b"\xff\xd8\xff\xe0 a small picture"
 
 
 class Cells(html.parser.HTMLParser):
-    """The cells of a page's tables, and the addresses it refers to."""
+    """The cells and sort keys of the tables of a page, and the addresses that it refers to."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ def write_rows(out: Path, rows: list[Row], name: str = "batch.json") -> None:
     (out / name).write_bytes(json_of(rows, {"task": "reconstruct"}))
 
 
-def test_a_page(tmp_path: Path) -> None:
+def test_page_shows_results_and_failures_of_all_shards(tmp_path: Path) -> None:
     done = [
         Row(
             f"v{i}",
@@ -68,11 +68,11 @@ def test_a_page(tmp_path: Path) -> None:
         )
         for i in range(1, 6)
     ]
-    bad = Row("<b>&", "/in/b.mp4", "failed", "damaged", error="<script>alert(1)</script>")
-    lost = Row("c", "/in/c.mp4", "failed", "killed", error="its process was ended by SIGKILL")
+    damaged = Row("<b>&", "/in/b.mp4", "failed", "damaged", error="<script>alert(1)</script>")
+    killed = Row("c", "/in/c.mp4", "failed", "killed", error="its process was ended by SIGKILL")
     out = tmp_path / "out"
-    write_rows(out, [*done[:3], bad], "batch-1-of-2.json")
-    write_rows(out, [*done[3:], lost], "batch-2-of-2.json")
+    write_rows(out, [*done[:3], damaged], "batch-1-of-2.json")
+    write_rows(out, [*done[3:], killed], "batch-2-of-2.json")
     (out / "v2").mkdir()
     (out / "v2" / "thumbnail.jpg").write_bytes(JPEG)
     assert main(["batch", "report", "--output", str(out), "--quiet"]) == 0
@@ -82,7 +82,8 @@ def test_a_page(tmp_path: Path) -> None:
     assert [link.partition(",")[0] for link in page.links] == ["data:image/jpeg;base64"]
     assert not re.search(r"https?:|url\(|@import", text)
     assert "5 done, 2 failed" in text
-    assert "1.7 CPU hours per 1,000 minutes" in text  # 30 s for 5 minutes
+    # 30 seconds of CPU time for 5 minutes are 1.67 hours for 1,000 minutes.
+    assert "1.7 CPU hours" in text
     assert page.tables["failures"][1:] == [
         ["damaged", "1", "<script>alert(1)</script>"],
         ["killed", "1", "its process was ended by SIGKILL"],
@@ -95,11 +96,11 @@ def test_a_page(tmp_path: Path) -> None:
     assert [row[1] for row in rows] == ["<b>&", "c", "v1", "v2", "v3", "v4", "v5"]
     points = heads.index("points")
     assert [row[points] for row in rows] == ["", "", *(f"{i},000" for i in range(1, 6))]
-    assert page.keys[-1][points] == "5000"  # what is sorted by
+    assert page.keys[-1][points] == "5000"
 
 
-def test_a_video_in_the_rows_of_several_runs_counts_once(tmp_path: Path) -> None:
-    """The first run was one of two shards, the second one has all videos."""
+def test_video_in_several_tables_counts_once(tmp_path: Path) -> None:
+    """The first run was one of two shards, and the second run had all videos."""
     write_rows(tmp_path, [Row("a", "/a", "done"), Row("b", "/b", "failed")], "batch-1-of-2.json")
     write_rows(tmp_path, [Row(n, f"/{n}", "done") for n in "abc"])
     write_page(tmp_path)
@@ -107,7 +108,7 @@ def test_a_video_in_the_rows_of_several_runs_counts_once(tmp_path: Path) -> None
     assert "3 videos, 3 done, 0 failed" in text
 
 
-def test_a_page_of_many_videos_shows_failures_first(tmp_path: Path) -> None:
+def test_page_of_many_videos_shows_failures_first(tmp_path: Path) -> None:
     rows = [Row(f"v{i:03}", f"/v{i}", "done", points=i) for i in range(300)]
     rows[250] = Row("v250", "/v250", "failed", "damaged", error="x")
     write_rows(tmp_path, rows)
@@ -121,7 +122,7 @@ def test_a_page_of_many_videos_shows_failures_first(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["../secret", "{root}/secret", "a\0b", "a\ud800"])
-def test_thumbnails_are_those_of_the_output(name: str, tmp_path: Path) -> None:
+def test_thumbnails_outside_the_output_are_not_shown(name: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "secret").mkdir()
     (tmp_path / "secret" / "thumbnail.jpg").write_bytes(JPEG)
@@ -131,7 +132,7 @@ def test_thumbnails_are_those_of_the_output(name: str, tmp_path: Path) -> None:
 
 
 def row_text(field: str, value: object) -> str:
-    """A file of rows, one of whose values is altered."""
+    """The JSON text of one row with a changed value."""
     facts = {**vars(Row("x", "/x", "done")), field: value}
     return json.dumps({"rows": [facts]})
 
@@ -150,7 +151,7 @@ def row_text(field: str, value: object) -> str:
         ('{"rows": [\n  {"name": ' + "[" * 100_000, "damaged"),
     ],
 )
-def test_no_page(
+def test_missing_or_damaged_tables_are_errors(
     content: str | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if content is not None:

@@ -1,4 +1,4 @@
-"""Inputs and outputs in an object store: S3 as moto has it, on the loopback."""
+"""Batches with inputs and outputs in an object store: S3 by moto on this machine."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ONCE = BatchOptions(retries=0)
 
 @pytest.fixture
 def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The file system of a store with a bucket 'bucket'."""
+    """The file system of an object store with the bucket 'bucket'."""
     server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
@@ -40,7 +40,7 @@ def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     server.stop()
 
 
-def test_a_batch_in_a_store(store: Any, clips: Path, tmp_path: Path) -> None:
+def test_batch_reads_from_and_writes_to_a_store(store: Any, clips: Path, tmp_path: Path) -> None:
     videos = ["a/clip0", "a/clip2", "b/clip1", "b/text"]
     for name in videos:
         store.put_file(str(clips / f"{name}.mp4"), f"bucket/in/{name}.mp4")
@@ -64,19 +64,19 @@ def test_a_batch_in_a_store(store: Any, clips: Path, tmp_path: Path) -> None:
     assert store.exists("bucket/out/report.html")
 
 
-def test_folders_are_whole_or_unmarked(store: Any, clips: Path, tmp_path: Path) -> None:
-    """A changed video takes the place of an earlier one; what others have made stays."""
-    list_of = tmp_path / "list"
-    list_of.write_text("s3://bucket/in/x.mp4\ns3://bucket/in/y.mp4\n")
+def test_unfinished_upload_is_completed(store: Any, clips: Path, tmp_path: Path) -> None:
+    """Stale files are removed, and files of others are kept."""
+    videos = tmp_path / "list"
+    videos.write_text("s3://bucket/in/x.mp4\ns3://bucket/in/y.mp4\n")
     for name in ("x", "y"):
         store.put_file(str(clips / "a" / "clip0.mp4"), f"bucket/in/{name}.mp4")
     store.pipe_file("bucket/out/y/mine", b"mine")
-    words = ["batch", "--inputs", str(list_of), "--output", "s3://bucket/out", "--task", "info"]
+    words = ["batch", "--inputs", str(videos), "--output", "s3://bucket/out", "--task", "info"]
     assert main([*words, "--quiet"]) == 1
     assert store.find("bucket/out/y") == ["bucket/out/y/mine"]
     first = store.cat_file("bucket/out/x/report.json")
 
-    # As an upload that was cut off leaves it.
+    # An interrupted upload leaves the folder in this state.
     store.rm_file("bucket/out/x/report.json")
     store.pipe_file("bucket/out/x/.unfinished", b'["images/stale.png", "thumbnail.jpg"]')
     store.pipe_file("bucket/out/x/images/mine.png", b"mine")

@@ -1,4 +1,4 @@
-"""The words of the command that does a task on a video."""
+"""The command line for options: it restores the same options."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ MATCH = MatchOptions(
         DensifyOptions(match=MatchOptions(images=ImageOptions(every=2))),
     ],
 )
-def test_a_command_gets_the_same_options(options: Options) -> None:
+def test_command_line_restores_the_options(options: Options) -> None:
     parser = Parser(prog="x")
     add_options(parser, type(options))
     namespace: argparse.Namespace = parser.parse_args(words_of(options))
@@ -49,7 +49,9 @@ def test_a_command_gets_the_same_options(options: Options) -> None:
     assert words_of(type(options)()) == []
 
 
-def test_paths_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_on_the_command_line_are_absolute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     words = words_of(MatchOptions(masks=MaskOptions(mask_path="masks")))
     assert words == [f"--mask_path={tmp_path / 'masks'}"]

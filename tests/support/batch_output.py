@@ -1,4 +1,4 @@
-"""Results of batches without their run times, and the processes of running batches."""
+"""Results of batches without their run times, and the processes of batches."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import colmap_av1
+
+# The folder in which the package under test is installed.
+PACKAGES = Path(colmap_av1.__file__).parents[1]
 # Fields that differ between equal runs.
 TIMES = ("seconds", "cpu_seconds")
 
