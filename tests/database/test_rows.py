@@ -1,14 +1,16 @@
+"""Writing matches into new databases and into databases that have images only."""
+
 from __future__ import annotations
 
 import hashlib
 import os
-import shutil
 import sqlite3
 import subprocess
 import sys
 import tempfile
 import textwrap
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,9 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from colmap_command import colmap, needs_colmap
 from conftest import TEST_PATHS
+from existing_database import CAMERA, alter, query
 from half_way import kill, start_writing
 from hypothesis import given
 from hypothesis import strategies as st
@@ -39,35 +43,12 @@ from colmap_av1.options import CameraOptions
 
 SCENE = make_scene()
 NAMES = [f"frame_{i:03d}.png" for i in range(SCENE.tracks.num_frames)]
-CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
 ROWS: dict[str, Any] = match_scene(SCENE, CAMERA)
-COLMAP = shutil.which("colmap")
-needs_colmap = pytest.mark.skipif(COLMAP is None, reason="no colmap command on PATH")
-
-
-def colmap(*arguments: object) -> None:
-    subprocess.run(
-        [str(COLMAP), *map(str, arguments)],
-        check=True,
-        capture_output=True,
-        env={**os.environ, "QT_QPA_PLATFORM": "offscreen"},
-    )
-
-
-def query(database: Path, sql: str) -> list[tuple[Any, ...]]:
-    connection = sqlite3.connect(database)
-    try:
-        return connection.execute(sql).fetchall()
-    finally:
-        connection.close()
 
 
 def dump(database: Path) -> list[str]:
-    connection = sqlite3.connect(database)
-    try:
+    with closing(sqlite3.connect(database)) as connection:
         return list(connection.iterdump())
-    finally:
-        connection.close()
 
 
 def write_blank_images(folder: Path) -> Path:
@@ -82,14 +63,14 @@ def check_model(model: pycolmap.Reconstruction, min_images: int = len(NAMES)) ->
         image.name: image.projection_center() for image in model.images.values() if image.has_pose
     }
     assert len(centers) >= min_images
-    seen = sorted(centers)
-    truth = SCENE.center[[NAMES.index(name) for name in seen]]
-    assert alignment_error(np.array([centers[name] for name in seen]), truth) < 0.05
+    names = sorted(centers)
+    truth = SCENE.center[[NAMES.index(name) for name in names]]
+    assert alignment_error(np.array([centers[name] for name in names]), truth) < 0.05
     assert model.compute_mean_reprojection_error() < 0.6
     assert model.num_points3D() > 800
 
 
-def check_maps(database: Path, folder: Path) -> None:
+def check_incremental_mapper(database: Path, folder: Path) -> None:
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
     options.random_seed = 0
@@ -97,7 +78,7 @@ def check_maps(database: Path, folder: Path) -> None:
     check_model(max(models.values(), key=lambda m: m.num_reg_images()))
 
 
-def check_maps_with_command(database: Path, folder: Path) -> None:
+def check_mapper_command(database: Path, folder: Path) -> None:
     (folder / "sparse").mkdir()
     colmap(
         "mapper",
@@ -108,14 +89,14 @@ def check_maps_with_command(database: Path, folder: Path) -> None:
     check_model(max(models, key=lambda m: m.num_reg_images()))
 
 
-def test_new_file_is_mapped(tmp_path: Path) -> None:
+def test_incremental_mapper_maps_a_new_database(tmp_path: Path) -> None:
     database = tmp_path / "new.db"
     write_matches(database, NAMES, CAMERA, **ROWS)
     assert [p.name for p in tmp_path.iterdir()] == ["new.db"]
-    check_maps(database, tmp_path)
+    check_incremental_mapper(database, tmp_path)
 
 
-def test_new_file_is_mapped_globally(tmp_path: Path) -> None:
+def test_global_mapper_maps_a_new_database(tmp_path: Path) -> None:
     database = tmp_path / "new.db"
     write_matches(database, NAMES, CAMERA, **ROWS)
     options = pycolmap.GlobalPipelineOptions()
@@ -125,19 +106,19 @@ def test_new_file_is_mapped_globally(tmp_path: Path) -> None:
 
 
 @needs_colmap
-def test_new_file_is_mapped_by_the_command(tmp_path: Path) -> None:
+def test_colmap_command_maps_a_new_database(tmp_path: Path) -> None:
     write_matches(tmp_path / "new.db", NAMES, CAMERA, **ROWS)
-    check_maps_with_command(tmp_path / "new.db", tmp_path)
+    check_mapper_command(tmp_path / "new.db", tmp_path)
 
 
 @needs_colmap
-def test_new_file_has_the_layout_of_the_command(tmp_path: Path) -> None:
-    colmap("database_creator", "--database_path", tmp_path / "theirs.db")
+def test_new_database_has_the_schema_of_colmap_3_8(tmp_path: Path) -> None:
+    colmap("database_creator", "--database_path", tmp_path / "colmap.db")
     write_matches(tmp_path / "ours.db", NAMES, CAMERA, **ROWS)
-    version = query(tmp_path / "theirs.db", "PRAGMA user_version")[0][0]
+    version = query(tmp_path / "colmap.db", "PRAGMA user_version")[0][0]
     if version // 100 != 38:
         pytest.skip(f"the colmap command is not 3.8 but {version}")
-    tables = [row[0] for row in query(tmp_path / "theirs.db", "SELECT name FROM sqlite_master")]
+    tables = [row[0] for row in query(tmp_path / "colmap.db", "SELECT name FROM sqlite_master")]
     assert tables == [
         row[0] for row in query(tmp_path / "ours.db", "SELECT name FROM sqlite_master")
     ]
@@ -146,10 +127,10 @@ def test_new_file_has_the_layout_of_the_command(tmp_path: Path) -> None:
         *(f"PRAGMA table_info({table})" for table in tables),
         *(f"PRAGMA foreign_key_list({table})" for table in tables),
     ):
-        assert query(tmp_path / "ours.db", sql) == query(tmp_path / "theirs.db", sql)
+        assert query(tmp_path / "ours.db", sql) == query(tmp_path / "colmap.db", sql)
 
 
-def test_pycolmap_reads_what_was_written(tmp_path: Path) -> None:
+def test_pycolmap_reads_the_written_rows(tmp_path: Path) -> None:
     write_matches(tmp_path / "new.db", NAMES, CAMERA, **ROWS)
     with pycolmap.Database.open(tmp_path / "new.db") as database:
         assert database.num_cameras() == 1
@@ -180,8 +161,9 @@ def test_pycolmap_reads_what_was_written(tmp_path: Path) -> None:
                 assert np.allclose(pose.rotation.quat, geometry.qvec[[1, 2, 3, 0]])
 
 
-def test_listed_images_keep_ids_that_do_not_follow_names(tmp_path: Path) -> None:
-    path = tmp_path / "listed.db"
+def test_existing_images_keep_their_ids(tmp_path: Path) -> None:
+    """The ids are in reverse order of the names."""
+    path = tmp_path / "existing.db"
     with pycolmap.Database.open(path) as database:
         camera_id = database.write_camera(CAMERA)
         for name in reversed(NAMES):
@@ -189,18 +171,18 @@ def test_listed_images_keep_ids_that_do_not_follow_names(tmp_path: Path) -> None
     before = query(path, "SELECT * FROM images")
     write_matches(path, NAMES, None, **ROWS)
     assert query(path, "SELECT * FROM images") == before
-    listed = {image.name: image for image in read_images(path)}
-    assert listed[NAMES[0]].image_id == len(NAMES)
-    assert listed[NAMES[0]].num_keypoints == len(ROWS["keypoints"][0].xy)
-    assert listed[NAMES[0]].num_matches == sum(
+    existing = {image.name: image for image in read_images(path)}
+    assert existing[NAMES[0]].image_id == len(NAMES)
+    assert existing[NAMES[0]].num_keypoints == len(ROWS["keypoints"][0].xy)
+    assert existing[NAMES[0]].num_matches == sum(
         len(m) for m, (i, _) in zip(ROWS["matches"], ROWS["pairs"], strict=True) if i == 0
     )
-    # COLMAP turns a geometry around when asked for it in the order of larger id first.
+    # If the larger id is given first, COLMAP inverts the stored geometry.
     index = next(k for k, g in enumerate(ROWS["geometries"]) if g.qvec is not None)
     i, j = ROWS["pairs"][index]
     geometry = ROWS["geometries"][index]
     with pycolmap.Database.open(path) as database:
-        a, b = listed[NAMES[i]].image_id, listed[NAMES[j]].image_id
+        a, b = existing[NAMES[i]].image_id, existing[NAMES[j]].image_id
         assert a > b
         stored = database.read_two_view_geometry(a, b)
     assert np.array_equal(stored.inlier_matches, geometry.inlier_matches)
@@ -208,10 +190,10 @@ def test_listed_images_keep_ids_that_do_not_follow_names(tmp_path: Path) -> None
     assert np.allclose(stored.H / np.linalg.norm(stored.H), geometry.H, atol=1e-6)
     assert np.allclose(stored.cam2_from_cam1.translation, geometry.tvec)
     assert np.allclose(stored.cam2_from_cam1.rotation.quat, geometry.qvec[[1, 2, 3, 0]])
-    check_maps(path, tmp_path)
+    check_incremental_mapper(path, tmp_path)
 
 
-def test_imported_images_are_mapped(tmp_path: Path) -> None:
+def test_images_imported_by_pycolmap_keep_their_rigs_and_are_mapped(tmp_path: Path) -> None:
     path = tmp_path / "imported.db"
     images = write_blank_images(tmp_path / "images")
     pycolmap.Database.open(path).close()
@@ -220,21 +202,22 @@ def test_imported_images_are_mapped(tmp_path: Path) -> None:
     rigs = query(path, "SELECT * FROM rigs"), query(path, "SELECT * FROM frames")
     write_matches(path, NAMES, None, **ROWS)
     assert (query(path, "SELECT * FROM rigs"), query(path, "SELECT * FROM frames")) == rigs
-    check_maps(path, tmp_path)
+    check_incremental_mapper(path, tmp_path)
 
 
-def test_empty_database_of_pycolmap_is_mapped(tmp_path: Path) -> None:
+def test_matches_in_an_empty_database_of_pycolmap_are_mapped(tmp_path: Path) -> None:
     path = tmp_path / "empty.db"
     pycolmap.Database.open(path).close()
     write_matches(path, NAMES, CAMERA, **ROWS)
     assert query(path, "SELECT COUNT(*) FROM frames") == [(0,)]
-    check_maps(path, tmp_path)
+    check_incremental_mapper(path, tmp_path)
 
 
 @pytest.mark.slow
 @needs_colmap
-def test_empty_rows_of_the_stock_matcher_are_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "stock.db"
+def test_empty_rows_of_the_colmap_matcher_are_replaced(tmp_path: Path) -> None:
+    """COLMAP writes empty rows for images without features and for pairs without matches."""
+    path = tmp_path / "colmap.db"
     images = write_blank_images(tmp_path / "images")
     colmap(
         "feature_extractor",
@@ -248,10 +231,10 @@ def test_empty_rows_of_the_stock_matcher_are_replaced(tmp_path: Path) -> None:
     write_matches(path, NAMES, None, **ROWS)
     assert query(path, "SELECT COUNT(*) FROM matches") == [(120,)]
     assert query(path, "PRAGMA user_version") == [(3800,)]
-    check_maps_with_command(path, tmp_path)
+    check_mapper_command(path, tmp_path)
 
 
-def test_one_camera_for_each_image(tmp_path: Path) -> None:
+def test_each_image_can_have_its_own_camera(tmp_path: Path) -> None:
     cameras = [make_camera(CameraOptions(), WIDTH, HEIGHT + i) for i in range(len(NAMES))]
     write_matches(tmp_path / "new.db", NAMES, cameras, **ROWS)
     images = read_images(tmp_path / "new.db")
@@ -260,7 +243,7 @@ def test_one_camera_for_each_image(tmp_path: Path) -> None:
     assert [image.height for image in images] == [c.height for c in cameras]
 
 
-def test_same_rows_give_the_same_bytes(tmp_path: Path) -> None:
+def test_same_rows_give_identical_files(tmp_path: Path) -> None:
     for name in ("a.db", "b.db"):
         write_matches(tmp_path / name, NAMES, CAMERA, **ROWS)
     digests = {hashlib.sha256(p.read_bytes()).digest() for p in tmp_path.iterdir()}
@@ -268,7 +251,7 @@ def test_same_rows_give_the_same_bytes(tmp_path: Path) -> None:
 
 
 @given(st.integers(1, MAX_NUM_IMAGES - 1), st.integers(1, MAX_NUM_IMAGES - 1))
-def test_pair_ids(a: int, b: int) -> None:
+def test_pair_ids_agree_with_pycolmap(a: int, b: int) -> None:
     pair_id = pair_id_from_image_ids(a, b)
     assert image_ids_from_pair_id(pair_id) == (min(a, b), max(a, b))
     assert pair_id == pycolmap.image_pair_to_pair_id(a, b)
@@ -276,7 +259,9 @@ def test_pair_ids(a: int, b: int) -> None:
 
 
 @given(st.permutations(range(4)), st.data())
-def test_matches_follow_the_smaller_id(order: list[int], data: st.DataObject) -> None:
+def test_columns_of_matches_are_in_order_of_image_ids(
+    order: list[int], data: st.DataObject
+) -> None:
     pairs = np.array([[0, 1], [0, 3], [1, 2], [2, 3]], dtype=np.int32)
     index = st.integers(0, 9)
     matches = [
@@ -289,7 +274,7 @@ def test_matches_follow_the_smaller_id(order: list[int], data: st.DataObject) ->
         ImageKeypoints(i, np.full((10, 2), i, np.float32), np.arange(10)) for i in range(4)
     ]
     names = [f"{i}.jpg" for i in range(4)]
-    # hypothesis runs many examples with one tmp_path.
+    # hypothesis would run all examples with the same tmp_path.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "example.db"
         write_matches(
@@ -318,8 +303,8 @@ def test_matches_follow_the_smaller_id(order: list[int], data: st.DataObject) ->
             assert np.array_equal(np.frombuffer(stored).reshape(3, 3), F if a < b else F.T)
 
 
-def make_empty(path: Path) -> None:
-    """A database in COLMAP 3.8's layout that lists the images and nothing else."""
+def write_images_only(path: Path) -> None:
+    """Write a database in the schema of COLMAP 3.8 with images and without keypoints."""
     nothing = [ImageKeypoints(i, np.empty((0, 2), np.float32), np.empty(0)) for i in range(16)]
     write_matches(
         path,
@@ -332,45 +317,39 @@ def make_empty(path: Path) -> None:
     )
 
 
-def damage_text(path: Path) -> None:
-    path.write_text("not a database, but long enough to be taken for one\n" * 100)
+def write_text(path: Path) -> None:
+    path.write_text("not a database, but as long as one\n" * 100)
 
 
-def other_database(path: Path) -> None:
-    connection = sqlite3.connect(path)
-    connection.execute("CREATE TABLE images (id INTEGER)")
-    connection.commit()
-    connection.close()
+def write_other_schema(path: Path) -> None:
+    alter(path, "CREATE TABLE images (id INTEGER)")
 
 
-def full_database(path: Path) -> None:
+def write_with_matches(path: Path) -> None:
     write_matches(path, NAMES, CAMERA, **ROWS)
 
 
-def other_images(path: Path) -> None:
+def write_other_images(path: Path) -> None:
     write_matches(path, [f"x{name}" for name in NAMES], CAMERA, **ROWS)
 
 
-def rigs_without_images(path: Path) -> None:
+def write_rigs_without_images(path: Path) -> None:
     pycolmap.Database.open(path).close()
-    connection = sqlite3.connect(path)
-    connection.execute("INSERT INTO rigs (ref_sensor_id, ref_sensor_type) VALUES (1, 0)")
-    connection.commit()
-    connection.close()
+    alter(path, "INSERT INTO rigs (ref_sensor_id, ref_sensor_type) VALUES (1, 0)")
 
 
 @pytest.mark.parametrize(
     ("prepare", "message"),
     [
-        (damage_text, "COLMAP"),
-        (other_database, "COLMAP"),
-        (full_database, "frame_000.png"),
-        (other_images, "frame_000.png"),
-        (rigs_without_images, "rigs"),
+        (write_text, "COLMAP"),
+        (write_other_schema, "COLMAP"),
+        (write_with_matches, "frame_000.png"),
+        (write_other_images, "frame_000.png"),
+        (write_rigs_without_images, "rigs"),
         (Path.mkdir, "folder"),
     ],
 )
-def test_refusals_change_nothing(
+def test_refused_path_is_not_changed(
     tmp_path: Path, prepare: Callable[[Path], None], message: str
 ) -> None:
     path = tmp_path / "given.db"
@@ -383,12 +362,12 @@ def test_refusals_change_nothing(
     assert [p.name for p in tmp_path.iterdir()] == ["given.db"]
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes and links of a Unix")
-def test_what_is_no_plain_file_stays(tmp_path: Path) -> None:
-    """A device as /dev/null is one for all: a file must not take its place."""
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs Unix pipes and links")
+def test_special_files_are_refused_and_links_are_followed(tmp_path: Path) -> None:
+    """All programs share a device such as /dev/null, so a file must not replace it."""
     os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "round").symlink_to("round")
-    for name in ("pipe", "round"):
+    (tmp_path / "loop").symlink_to("loop")
+    for name in ("pipe", "loop"):
         with pytest.raises(DatabaseError, match=name):
             write_matches(tmp_path / name, NAMES, CAMERA, **ROWS)
         with pytest.raises(DatabaseError, match=name):
@@ -400,12 +379,13 @@ def test_what_is_no_plain_file_stays(tmp_path: Path) -> None:
     assert len(read_images(tmp_path / "new.db")) == len(NAMES)
 
 
-def test_folder_that_is_not_there(tmp_path: Path) -> None:
+def test_missing_folder_is_reported(tmp_path: Path) -> None:
     with pytest.raises(DatabaseError, match="folder"):
         write_matches(tmp_path / "no" / "new.db", NAMES, CAMERA, **ROWS)
 
 
-def test_leftover_log_is_not_replayed_into_a_new_file(tmp_path: Path) -> None:
+def test_new_database_is_refused_next_to_an_old_log(tmp_path: Path) -> None:
+    """SQLite would apply the old log to the new database."""
     (tmp_path / "new.db-wal").write_bytes(b"old")
     with pytest.raises(DatabaseError, match=r"new\.db-wal"):
         write_matches(tmp_path / "new.db", NAMES, CAMERA, **ROWS)
@@ -414,17 +394,14 @@ def test_leftover_log_is_not_replayed_into_a_new_file(tmp_path: Path) -> None:
 def test_matches_without_keypoints_are_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
     write_matches(path, NAMES, CAMERA, **ROWS)
-    connection = sqlite3.connect(path)
-    connection.execute("DELETE FROM keypoints")
-    connection.commit()
-    connection.close()
+    alter(path, "DELETE FROM keypoints")
     with pytest.raises(DatabaseError, match="matches"):
         write_matches(path, NAMES, None, **ROWS)
 
 
-def test_absent_and_empty_files_list_nothing(tmp_path: Path) -> None:
-    assert read_images(tmp_path / "absent.db") == []
-    assert read_cameras(tmp_path / "absent.db") == {}
+def test_missing_and_empty_files_have_no_images(tmp_path: Path) -> None:
+    assert read_images(tmp_path / "missing.db") == []
+    assert read_cameras(tmp_path / "missing.db") == {}
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "empty.db").touch()
     assert read_images(tmp_path / "empty.db") == []
@@ -432,10 +409,12 @@ def test_absent_and_empty_files_list_nothing(tmp_path: Path) -> None:
     assert len(read_images(tmp_path / "empty.db")) == len(NAMES)
 
 
-def test_locked_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_locked_database_is_reported_and_not_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("colmap_av1.database.file._BUSY_TIMEOUT", 0.2)
     path = tmp_path / "locked.db"
-    make_empty(path)
+    write_images_only(path)
     before = dump(path)
     other = sqlite3.connect(path, isolation_level=None)
     other.execute("BEGIN EXCLUSIVE")
@@ -450,14 +429,14 @@ def test_locked_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 class Interruption(BaseException):
-    """Stands for an interrupt from the keyboard."""
+    """Stands for KeyboardInterrupt: no `except Exception` catches it."""
 
 
 @pytest.mark.parametrize("existing", [False, True])
-def test_interruption_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> None:
+def test_interrupted_write_leaves_the_file_unchanged(tmp_path: Path, existing: bool) -> None:
     path = tmp_path / "given.db"
     if existing:
-        make_empty(path)
+        write_images_only(path)
     before = path.read_bytes() if existing else None
 
     class Interrupting(list):  # type: ignore[type-arg]
@@ -474,9 +453,9 @@ def test_interruption_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) 
 
 
 @pytest.mark.parametrize("journal", ["delete", "wal"])
-def test_kill_in_mid_transaction_leaves_the_old_content(tmp_path: Path, journal: str) -> None:
+def test_killed_write_leaves_the_old_content(tmp_path: Path, journal: str) -> None:
     path = tmp_path / "given.db"
-    make_empty(path)
+    write_images_only(path)
     query(path, f"PRAGMA journal_mode = {journal}")
     before = dump(path)
     kill(start_writing(path, "error", "test_rows", "ROWS"))
@@ -486,10 +465,10 @@ def test_kill_in_mid_transaction_leaves_the_old_content(tmp_path: Path, journal:
 
 
 @pytest.mark.parametrize("existing", [False, True])
-def test_full_disk_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> None:
+def test_full_disk_leaves_the_file_unchanged(tmp_path: Path, existing: bool) -> None:
     path = tmp_path / "given.db"
     if existing:
-        make_empty(path)
+        write_images_only(path)
     before = path.read_bytes() if existing else None
     script = """
         import os, resource, signal, sys
@@ -498,7 +477,7 @@ def test_full_disk_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> 
         from colmap_av1.database.writing import write_matches
         from colmap_av1.errors import DatabaseError
 
-        # Writes beyond this size fail, as they do on a full disk.
+        # Writing more than this fails, as on a full disk.
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
         try:
@@ -509,7 +488,7 @@ def test_full_disk_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> 
     output = subprocess.check_output(
         [sys.executable, "-c", textwrap.dedent(script), path, TEST_PATHS],
         text=True,
-        cwd=tmp_path,  # else the checkout would hide the installed package
+        cwd=tmp_path,  # in the checkout, its package would hide the installed one
     )
     assert "disk" in output
     assert output.count("\n") == 1
@@ -517,19 +496,19 @@ def test_full_disk_leaves_the_file_as_it_was(tmp_path: Path, existing: bool) -> 
     assert [p.name for p in tmp_path.iterdir()] == (["given.db"] if existing else [])
 
 
-def test_default_camera_is_a_guess() -> None:
+def test_default_camera_has_an_assumed_focal_length() -> None:
     camera = make_camera(CameraOptions(), 450, 800)
     assert camera.model_name == "SIMPLE_RADIAL"
     assert camera.params.tolist() == [720, 225, 400, 0]
     assert not camera.has_prior_focal_length
 
 
-def test_told_focal_length_lets_two_parameters_be_found() -> None:
+def test_given_focal_length_selects_two_distortion_parameters() -> None:
     camera = make_camera(CameraOptions(), 450, 800, focal_length=500)
     assert camera.model_name == "RADIAL"
     assert camera.params.tolist() == [500, 225, 400, 0, 0]
     assert camera.has_prior_focal_length
-    # Parameters alone are those of COLMAP's default model.
+    # Parameters without a model belong to COLMAP's default model.
     given = make_camera(CameraOptions(camera_params="480,225,400,0.1"), 450, 800, focal_length=500)
     assert (given.model_name, given.params[0]) == ("SIMPLE_RADIAL", 480)
 
@@ -542,14 +521,14 @@ def test_told_focal_length_lets_two_parameters_be_found() -> None:
         if name not in ("INVALID", "EQUIRECTANGULAR")
     ],
 )
-def test_every_model_survives_a_round_trip(tmp_path: Path, model: str) -> None:
-    guess = make_camera(CameraOptions(model), WIDTH, HEIGHT)
-    text = ",".join(str(p + 0.25) for p in guess.params)
+def test_every_camera_model_is_read_back_as_written(tmp_path: Path, model: str) -> None:
+    default = make_camera(CameraOptions(model), WIDTH, HEIGHT)
+    text = ",".join(str(p + 0.25) for p in default.params)
     camera = make_camera(CameraOptions(model, text), WIDTH, HEIGHT)
     write_matches(tmp_path / "new.db", NAMES, camera, **ROWS)
     stored = read_cameras(tmp_path / "new.db")[1]
     assert stored.model_name == model
-    assert stored.params.tolist() == [p + 0.25 for p in guess.params]
+    assert stored.params.tolist() == [p + 0.25 for p in default.params]
     assert stored.has_prior_focal_length
     with pycolmap.Database.open(tmp_path / "new.db") as database:
         assert database.read_camera(1).model_name == model

@@ -1,9 +1,8 @@
-"""Writing into databases that hold rows already."""
+"""Writing matches into databases that already have keypoints and matches."""
 
 from __future__ import annotations
 
 import os
-import shutil
 import sqlite3
 import subprocess
 import textwrap
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from colmap_command import COLMAP, colmap, needs_colmap
 from existing_database import (
     CAMERA,
     LAYOUTS,
@@ -40,44 +40,33 @@ from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import OnExisting
 
-COLMAP = shutil.which("colmap")
-needs_colmap = pytest.mark.skipif(COLMAP is None, reason="no colmap command on PATH")
 MODES: tuple[OnExisting, ...] = ("append", "replace")
 
-# Layouts that a version's programs open: those up to their own, but COLMAP 3.8 its own alone.
+# Schemas that a version of COLMAP opens: its own and older ones, but COLMAP 3.8 only its own.
 READS = {
     "3.8": ("3.8",),
     "3.11.1": ("3.8", "3.11", "3.13"),
     "3.13.0": ("3.8", "3.11", "3.13"),
     "installed": LAYOUTS,
 }
-# What is in a database of a layout before the matches are written, and what a version maps.
+# Mapper, schema, content of the database before matches are written, and how they are written.
 MAPPED: list[tuple[str, str, str, OnExisting]] = [
     (mapper, layout, *state)
     for mapper, layouts in READS.items()
     for layout in layouts
     for state in (("listed", "error"), ("sift", "append"), ("sift", "replace"))
-    # The layout stays as it is: one shows what the other states are like.
+    # Writing does not change the schema, so one schema is enough for the other states.
     if state == ("sift", "append") or layout == layouts[-1]
 ]
 
 
-def colmap(*words: object) -> None:
-    subprocess.run(
-        [str(COLMAP), *map(str, words)],
-        check=True,
-        capture_output=True,
-        env={**os.environ, "QT_QPA_PLATFORM": "offscreen"},
-    )
-
-
 def other_python(version: str) -> str:
-    """An interpreter that has another version of pycolmap."""
+    """Path of a Python with another version of pycolmap; skips the test if there is none."""
     folder = os.environ.get("COLMAP_AV1_VENVS")
     if folder is None:
         pytest.skip(
-            "set COLMAP_AV1_VENVS to a folder with virtual environments 3.11.1 and 3.13.0 that "
-            "hold these versions of pycolmap"
+            "set COLMAP_AV1_VENVS to a folder of virtual environments 3.11.1 and 3.13.0 with "
+            "these versions of pycolmap"
         )
     python = Path(folder) / version / "bin" / "python"
     if not python.exists():
@@ -125,7 +114,7 @@ def check_model(model: pycolmap.Reconstruction, least_points: int) -> None:
 
 
 def map_with(mapper: str, database: Path, folder: Path) -> pycolmap.Reconstruction:
-    """Map with a version's mapper and return the model with the most images."""
+    """Run the incremental mapper of a version, and return the model with the most images."""
     output = folder / "models"
     output.mkdir()
     if mapper == "3.8":
@@ -180,21 +169,21 @@ def test_global_mapper_maps_appended_rows(tmp_path: Path, layout: str) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_append_keeps_what_is_there(tmp_path: Path, layout: str) -> None:
+def test_append_keeps_existing_rows(tmp_path: Path, layout: str) -> None:
     path = tmp_path / "given.db"
     ids = make_existing(path, layout, "sift")
     before = content(path)
     write_matches(path, NAMES, None, **OURS, on_existing="append")
     after = content(path)
-    unchanged = {"keypoints", "descriptors", "matches", "two_view_geometries"}
-    assert {k: v for k, v in after.items() if k not in unchanged} == {
-        k: v for k, v in before.items() if k not in unchanged
+    changed = {"keypoints", "descriptors", "matches", "two_view_geometries"}
+    assert {k: v for k, v in after.items() if k not in changed} == {
+        k: v for k, v in before.items() if k not in changed
     }
-    firsts = []
+    num_existing = []
     for index, name in enumerate(NAMES):
         theirs, ours = sift_keypoints(index), OURS["keypoints"][index].xy
         found = read_keypoints(path, ids[name])
-        firsts.append(len(theirs))
+        num_existing.append(len(theirs))
         assert np.array_equal(found[: len(theirs)], theirs)
         assert np.array_equal(found[len(theirs) :, :2], ours)
         assert (found[len(theirs) :, 2:] == [1, 0, 0, 1]).all()
@@ -212,7 +201,7 @@ def test_append_keeps_what_is_there(tmp_path: Path, layout: str) -> None:
         assert np.array_equal(THEIRS["pairs"], OURS["pairs"])
         for (i, j), theirs, ours in zip(OURS["pairs"], THEIRS[kind], OURS[kind], strict=True):
             rows = [getattr(k, "inlier_matches", k) for k in (theirs, ours)]
-            rows[1] = rows[1] + np.array([firsts[i], firsts[j]], np.uint32)
+            rows[1] = rows[1] + np.array([num_existing[i], num_existing[j]], np.uint32)
             found = read_pair(path, table, ids[NAMES[i]], ids[NAMES[j]])
             assert np.array_equal(found, np.concatenate(rows))
 
@@ -257,7 +246,7 @@ def test_replace_removes_rows_of_the_named_images_only(tmp_path: Path, layout: s
     assert content(path) == after
 
 
-def test_error_refuses_what_append_takes(tmp_path: Path) -> None:
+def test_existing_keypoints_are_an_error_by_default(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
     make_existing(path, "3.8", "sift")
     before = path.read_bytes()
@@ -267,6 +256,7 @@ def test_error_refuses_what_append_takes(tmp_path: Path) -> None:
 
 
 def one_pair(num: int, config: TwoViewConfig) -> dict[str, Any]:
+    """Rows of two images with 60 matches, `num` of which are inliers."""
     xy = np.arange(200, dtype=np.float32).reshape(100, 2)
     inliers = np.repeat(np.arange(num, dtype=np.uint32), 2).reshape(num, 2)
     return {
@@ -285,20 +275,28 @@ def one_pair(num: int, config: TwoViewConfig) -> dict[str, Any]:
         ((6, 20), (TwoViewConfig.CALIBRATED, 20), (6, 40, -1)),
         ((3, 30), (TwoViewConfig.DEGENERATE, 10), (3, 30, -1)),
         ((1, 0), (TwoViewConfig.CALIBRATED, 20), (2, 20, 20)),
-        ((1, 12), (TwoViewConfig.CALIBRATED, 20), (2, 20, 20)),  # degenerate: no inliers
-        ((7, 50), (TwoViewConfig.CALIBRATED, 20), (2, 20, 20)),  # a watermark, not the scene
-        ((0, 50), (TwoViewConfig.CALIBRATED, 20), (2, 70, 20)),  # imported, never estimated
-        ((8, 50), (TwoViewConfig.CALIBRATED, 20), (2, 70, 20)),  # of several models
+        ((1, 12), (TwoViewConfig.CALIBRATED, 20), (2, 20, 20)),  # degenerate, so without inliers
+        (
+            (7, 50),
+            (TwoViewConfig.CALIBRATED, 20),
+            (2, 20, 20),
+        ),  # a watermark, not the scene
+        ((0, 50), (TwoViewConfig.CALIBRATED, 20), (2, 70, 20)),  # imported without an estimate
+        ((8, 50), (TwoViewConfig.CALIBRATED, 20), (2, 70, 20)),  # inliers of several models
         ((0, 50), (TwoViewConfig.DEGENERATE, 0), (0, 50, -1)),
     ],
 )
-def test_merged_geometry_is_the_better_supported(
+def test_geometry_with_more_inliers_is_kept_when_merged(
     tmp_path: Path,
     theirs: tuple[int, int],
     ours: tuple[TwoViewConfig, int],
     merged: tuple[int, int, float],
 ) -> None:
-    """Each is a kind of geometry and its number of inliers; merged ones name F too."""
+    """The geometries of a pair, theirs and ours, are merged.
+
+    Each is given as its config and number of inliers, the merged one also with F[0, 0]: -1 in
+    theirs and the number of inliers in ours.
+    """
     (their_config, their_inliers), (our_config, our_inliers) = theirs, ours
     config, inliers, F = merged
     path = tmp_path / "given.db"
@@ -323,8 +321,12 @@ def test_merged_geometry_is_the_better_supported(
     assert len(read_pair(path, "matches", 1, 2)) == 120
 
 
-def test_matches_of_a_pair_without_a_row_are_its_inliers(tmp_path: Path) -> None:
-    """As importers leave pairs; a matcher would skip the pair once it has both rows."""
+def test_inliers_become_the_matches_of_a_pair_without_matches(tmp_path: Path) -> None:
+    """Programs that import matches write only geometries.
+
+    Without the inliers among its matches, the pair would lose them: matchers skip a pair that has
+    matches and a geometry.
+    """
     path = tmp_path / "given.db"
     write_matches(path, NAMES[:2], CAMERA, **one_pair(40, TwoViewConfig.UNCALIBRATED))
     alter(path, "DELETE FROM matches")
@@ -355,9 +357,9 @@ def test_empty_rows_are_replaced(tmp_path: Path, layout: str) -> None:
     assert query(path, "SELECT MIN(rows) > 0, MIN(config) FROM two_view_geometries") == [(1, 2)]
 
 
-@pytest.mark.parametrize(("layout", "mode"), zip(LAYOUTS, MODES * 2, strict=True))
+@pytest.mark.parametrize(("layout", "mode"), list(zip(LAYOUTS, MODES * 2, strict=True)))
 def test_images_are_added_with_their_frames(tmp_path: Path, layout: str, mode: OnExisting) -> None:
-    """Half of the images are listed; the database is mapped with all of them."""
+    """The database has half of the images before; then it is mapped with all of them."""
     path = tmp_path / "given.db"
     list_images(path, layout, NAMES[:4])
     with pytest.raises(DatabaseError, match="4 images"):
@@ -399,7 +401,7 @@ def test_images_without_a_frame_get_one(tmp_path: Path, missing: int) -> None:
     assert query(path, "SELECT * FROM rigs") == [(1, 1, 0)]
 
 
-def test_frames_stay_absent_where_there_are_none(tmp_path: Path) -> None:
+def test_no_frames_are_added_to_a_database_without_frames(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
     list_images(path, "4.2")
     for table in ("frame_data", "frames", "rigs"):
@@ -408,7 +410,7 @@ def test_frames_stay_absent_where_there_are_none(tmp_path: Path) -> None:
     assert query(path, "SELECT * FROM rigs") == query(path, "SELECT * FROM frames") == []
 
 
-def test_frame_of_a_rig_of_several_cameras_is_not_guessed(tmp_path: Path) -> None:
+def test_image_without_a_frame_is_refused_if_its_rig_has_several_cameras(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
     ids = list_images(path, "3.13")
     alter(path, "UPDATE rigs SET ref_sensor_id = 9")
@@ -429,7 +431,8 @@ def test_frame_of_a_rig_of_several_cameras_is_not_guessed(tmp_path: Path) -> Non
         ("UPDATE two_view_geometries SET rows = 9", "matches"),
     ],
 )
-def test_damaged_rows_are_not_added_to(tmp_path: Path, sql: str, message: str) -> None:
+def test_append_refuses_damaged_rows(tmp_path: Path, sql: str, message: str) -> None:
+    """Replacing them works."""
     path = tmp_path / "given.db"
     make_existing(path, "3.11", "sift")
     alter(path, sql)
@@ -442,26 +445,29 @@ def test_damaged_rows_are_not_added_to(tmp_path: Path, sql: str, message: str) -
 
 
 def check_matched_again(path: Path, before: list[Any]) -> None:
-    """No appended keypoint has a match in a pair that was matched anew; others are as before."""
+    """Check that pairs in `before` are unchanged, and others have matches of SIFT keypoints only.
+
+    Appended keypoints have descriptors of zeros, which a matcher must not match.
+    """
     num_sift = {
         i.image_id: len(THEIRS["keypoints"][NAMES.index(i.name)].xy) for i in read_images(path)
     }
-    known = {row[0]: row for row in before}
-    matched_anew = 0
+    kept = {row[0]: row for row in before}
+    num_new_matches = 0
     for row in query(path, "SELECT pair_id, rows, cols, data FROM matches ORDER BY 1"):
-        if row[0] in known:
-            assert row == known[row[0]]
+        if row[0] in kept:
+            assert row == kept[row[0]]
             continue
         a, b = divmod(row[0], 2147483647)
         found = np.frombuffer(row[3] or b"", np.uint32).reshape(row[1], 2)
         assert (found < [num_sift[a], num_sift[b]]).all()
-        matched_anew += len(found)
+        num_new_matches += len(found)
     assert len(query(path, "SELECT pair_id FROM matches")) == NUM_IMAGES * (NUM_IMAGES - 1) // 2
-    assert matched_anew > 100
+    assert num_new_matches > 100
 
 
 def drop_pairs(path: Path) -> list[Any]:
-    """Remove what a matcher will match again; returns the rows of the rest."""
+    """Remove a third of the pairs, for a matcher, and return the matches of the others."""
     for table in ("matches", "two_view_geometries"):
         alter(path, f"DELETE FROM {table} WHERE pair_id % 3 = 0")
     rows = query(path, "SELECT pair_id, rows, cols, data FROM matches ORDER BY 1")
@@ -470,8 +476,8 @@ def drop_pairs(path: Path) -> list[Any]:
 
 
 @needs_colmap
-def test_stock_matcher_runs_after_an_append(tmp_path: Path) -> None:
-    """Guided, so that it compares the numbers of keypoints and descriptors."""
+def test_colmap_matcher_runs_after_an_append(tmp_path: Path) -> None:
+    """Guided matching requires as many descriptors as keypoints."""
     path = tmp_path / "given.db"
     make_existing(path, "3.8", "sift")
     write_matches(path, NAMES, None, **OURS, on_existing="append")
@@ -485,7 +491,7 @@ def test_stock_matcher_runs_after_an_append(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_matcher_of_pycolmap_runs_after_an_append(tmp_path: Path, layout: str) -> None:
+def test_pycolmap_matcher_runs_after_an_append(tmp_path: Path, layout: str) -> None:
     path = tmp_path / "given.db"
     make_existing(path, layout, "sift")
     write_matches(path, NAMES, None, **OURS, on_existing="append")
@@ -499,32 +505,35 @@ def test_matcher_of_pycolmap_runs_after_an_append(tmp_path: Path, layout: str) -
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("journal", ["delete", "wal"])
-def test_kill_leaves_the_old_content(tmp_path: Path, journal: str, mode: OnExisting) -> None:
+def test_killed_write_leaves_the_old_content(
+    tmp_path: Path, journal: str, mode: OnExisting
+) -> None:
     path = tmp_path / "given.db"
     make_existing(path, "4.2", "sift")
     query(path, f"PRAGMA journal_mode = {journal}")
     before = content(path)
     kill(start_writing(path, mode))
-    left = path.with_name(f"given.db-{'journal' if journal == 'delete' else 'wal'}")
-    assert left.stat().st_size > 0  # it was killed in the middle of writing
+    log = path.with_name(f"given.db-{'journal' if journal == 'delete' else 'wal'}")
+    assert log.stat().st_size > 0  # the process was killed inside a transaction
     assert content(path) == before
     write_matches(path, NAMES, None, **OURS, on_existing=mode)
     assert content(path) != before
 
 
-def test_leftover_of_a_killed_new_file_is_removed(tmp_path: Path) -> None:
+def test_partial_file_of_a_killed_process_is_removed(tmp_path: Path) -> None:
     path = tmp_path / "new [1].db"
     process = start_writing(path, "error")
     (partial,) = tmp_path.iterdir()
     assert partial.name.startswith(".new [1].db.")
     try:
-        # Another process makes the file meanwhile; the partial one is still being written.
+        # The first process is still writing the partial file, which must stay.
         write_matches(path, NAMES, CAMERA, **OURS)
         assert sorted(p.name for p in tmp_path.iterdir()) == [partial.name, path.name]
     finally:
         kill(process)
     assert partial.exists()
     path.unlink()
+    # A file with a similar name that no process of this package wrote must stay, too.
     (tmp_path / ".new [1].db.1.partial").touch()
     write_matches(path, NAMES, CAMERA, **OURS)
     assert sorted(p.name for p in tmp_path.iterdir()) == [
