@@ -1,6 +1,6 @@
-"""Random COLMAP databases under random damage: no trace, and no failure alters the file.
+"""Random damage to COLMAP databases: errors are one line and do not change the file.
 
-COLMAP_AV1_EXAMPLES sets how many sequences of steps are tried.
+COLMAP_AV1_EXAMPLES sets the number of random sequences of steps.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from colmap_av1.view import view_database
 EXAMPLES = os.environ.get("COLMAP_AV1_EXAMPLES")
 NAMES = ["f0.png", "f1.png", "f2.png"]
 NUM_KEYPOINTS = 20
-# CPU time of one step in seconds.
+# Largest CPU time of a step, in seconds.
 LIMIT = 2.0
 TABLES = {
     "cameras": ("camera_id", "model", "width", "height", "params", "prior_focal_length"),
@@ -58,7 +58,7 @@ VALUES = (
     | st.sampled_from([NAMES[0], "", "../x.png", "/x.png", "a\0b", "a b.png", "\ud7ff", "1", "-1"])
     | st.text(max_size=8)
 )
-LAYOUT_CHANGES = st.sampled_from(
+SCHEMA_CHANGES = st.sampled_from(
     [
         *(f"DROP TABLE {table}" for table in TABLES),
         *(f"ALTER TABLE {table} RENAME TO other" for table in TABLES),
@@ -87,7 +87,7 @@ LAYOUT_CHANGES = st.sampled_from(
 
 
 def new_rows(seed: int) -> dict[str, Any]:
-    """Keypoints and matches of the three images."""
+    """Keypoints, matches and geometries of the three images."""
     rng = np.random.default_rng(seed)
     keypoints = [
         ImageKeypoints(
@@ -111,7 +111,7 @@ def new_rows(seed: int) -> dict[str, Any]:
 
 
 class Databases(RuleBasedStateMachine):
-    """A database that is written, damaged, and read by everything that reads one."""
+    """A database that is written, damaged, and read by all functions that read databases."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -123,7 +123,10 @@ class Databases(RuleBasedStateMachine):
         shutil.rmtree(self.folder)
 
     def attempt(self, run: Callable[[], object], *, writes: bool = False) -> None:
-        """Run something: it works, or fails in one line and leaves the file as it was."""
+        """Run a function, which must succeed or fail with a one-line error.
+
+        If it fails or does not write, the file must not change.
+        """
         before = self.path.read_bytes()
         start = time.process_time()
         message = None
@@ -162,8 +165,8 @@ class Databases(RuleBasedStateMachine):
             which,
         )
 
-    @rule(change=LAYOUT_CHANGES)
-    def change_layout(self, change: str) -> None:
+    @rule(change=SCHEMA_CHANGES)
+    def change_schema(self, change: str) -> None:
         self.execute(change)
 
     def execute(self, sql: str, *values: object) -> None:
@@ -184,7 +187,7 @@ class Databases(RuleBasedStateMachine):
     def change_bytes(self, places: list[tuple[float, int]], at_start: bool) -> None:
         data = bytearray(self.path.read_bytes())
         for place, value in places if data else ():
-            # Half of them where the layout is.
+            # The first page holds the schema, so half of the changes are there.
             data[int(place * (min(4096, len(data)) if at_start else len(data)))] = value
         self.path.write_bytes(data)
 
@@ -193,8 +196,8 @@ class Databases(RuleBasedStateMachine):
         os.truncate(self.path, int(share * self.path.stat().st_size))
 
     @invariant()
-    def everything_reads_it(self) -> None:
-        if not self.path.exists():  # before it is made
+    def all_functions_read_it(self) -> None:
+        if not self.path.exists():  # invariants are also checked before `make`
             return
         self.attempt(lambda: check_database(self.path))
         self.attempt(lambda: read_images(self.path))
