@@ -1,4 +1,4 @@
-"""A database mapped by COLMAP's mappers, through the function and the command."""
+"""Mapping a database with COLMAP's mappers, by the function and by the command."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import Mapper
 from colmap_av1.reconstruct import ReconstructReport
 
-# Few tracks are mapped quickly.
+# Few tracks, so that mapping is fast.
 MATCHING = MatchOptions(
     images=ImageOptions(every=EVERY),
     density=DensityOptions(preset="sparse", max_tracks_per_image=300),
@@ -55,15 +55,17 @@ def database(images: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("mapper", ["incremental", "global"])
-def test_model(database: Path, images: Path, truth: Truth, mapper: Mapper, tmp_path: Path) -> None:
+def test_model_has_all_images_and_correct_poses(
+    database: Path, images: Path, truth: Truth, mapper: Mapper, tmp_path: Path
+) -> None:
     before = database.read_bytes()
-    placed: list[tuple[str, int, int | None]] = []
+    steps: list[tuple[str, int, int | None]] = []
     report = map_database(
         database,
         images,
         tmp_path / "model",
         options=MapOptions(mapper=mapper),
-        progress=lambda *told: placed.append(told),
+        progress=lambda *step: steps.append(step),
     )
     assert database.read_bytes() == before
     assert sorted(p.name for p in database.parent.iterdir()) == ["a.db"]
@@ -73,23 +75,22 @@ def test_model(database: Path, images: Path, truth: Truth, mapper: Mapper, tmp_p
         "place.json",
     ]
     assert (report.num_images, report.num_registered) == (NUM_IMAGES, (NUM_IMAGES,))
-    assert [told for told in placed if told[0] == "poses"][-1] == ("poses", NUM_IMAGES, NUM_IMAGES)
+    assert [step for step in steps if step[0] == "poses"][-1] == ("poses", NUM_IMAGES, NUM_IMAGES)
     model = read_model(report.model)
     assert report.figures.num_points == model.num_points3D() > 300
     assert report.figures.mean_error == pytest.approx(model.compute_mean_reprojection_error())
     assert pose_errors(model_poses(model, 60), truth.cam_from_world).rotation < 1
-    # The clip is in colour.
     colours = np.array([point.color for point in model.points3D.values()])
     assert 50 < colours.mean() < 200
     assert colours.std() > 10
 
 
-def test_most_images_come_first(database: Path, images: Path, tmp_path: Path) -> None:
-    """Where the images fall apart into two models, folder 0 is the larger one."""
-    apart = tmp_path / "apart.db"
-    shutil.copyfile(database, apart)
+def test_largest_model_comes_first(database: Path, images: Path, tmp_path: Path) -> None:
+    """No matches join the first images with the others, so there are two models."""
+    split = tmp_path / "split.db"
+    shutil.copyfile(database, split)
     num_first = 7
-    with sqlite3.connect(apart) as connection:
+    with sqlite3.connect(split) as connection:
         ids = [row[0] for row in connection.execute("SELECT image_id FROM images ORDER BY name")]
         for table in ("matches", "two_view_geometries"):
             connection.executemany(
@@ -98,20 +99,20 @@ def test_most_images_come_first(database: Path, images: Path, tmp_path: Path) ->
             )
     connection.close()
     options = MapOptions(mapper="global")
-    report = map_database(apart, images, tmp_path / "model", options=options)
+    report = map_database(split, images, tmp_path / "model", options=options)
     sizes = [read_model(tmp_path / "model" / str(i)).num_reg_images() for i in range(2)]
     assert report.num_registered == tuple(sizes) == (NUM_IMAGES - num_first, num_first)
     assert any("coordinates" in warning for warning in report.warnings)
 
 
-def test_a_model_of_images_that_the_first_one_has_is_said(
+def test_second_model_of_the_same_images_is_reported(
     database: Path,
     images: Path,
     made: ReconstructReport,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A mapper may begin once more with two images."""
+    """A mapper can start a second model with images that are already registered."""
 
     def mapped(_: Path, output: Path, *__: object, log: Path, **___: object) -> tuple[int, int]:
         for number in range(2):
@@ -128,6 +129,7 @@ def test_intrinsics_are_kept_in_forward_motion(
     database: Path, images: Path, tmp_path: Path
 ) -> None:
     def focal_lengths(report: MapReport) -> tuple[float, float]:
+        """The focal length of the database, and that of the model."""
         given = pycolmap.Database.open(copy)
         (camera,) = given.read_all_cameras()
         given.close()
@@ -142,10 +144,12 @@ def test_intrinsics_are_kept_in_forward_motion(
     assert refined != given
 
 
-def test_bad_input(database: Path, images: Path, tmp_path: Path) -> None:
+def test_bad_databases_and_folders_are_reported(
+    database: Path, images: Path, tmp_path: Path
+) -> None:
     output = tmp_path / "model"
     with pytest.raises(DatabaseError, match="no such file"):
-        map_database(tmp_path / "no.db", images, output)
+        map_database(tmp_path / "missing.db", images, output)
     (tmp_path / "empty.db").write_bytes(b"")
     with pytest.raises(DatabaseError, match="empty"):
         map_database(tmp_path / "empty.db", images, output)
@@ -157,7 +161,7 @@ def test_bad_input(database: Path, images: Path, tmp_path: Path) -> None:
     with pytest.raises(DatabaseError, match="15"):
         map_database(unmatched, images, output)
     with pytest.raises(ImageError, match="no such folder"):
-        map_database(database, tmp_path / "nowhere", output)
+        map_database(database, tmp_path / "missing", output)
     (tmp_path / "some").mkdir()
     with pytest.raises(ImageError, match=r"frame_000000\.png"):
         map_database(database, tmp_path / "some", output)
@@ -170,38 +174,38 @@ def test_bad_input(database: Path, images: Path, tmp_path: Path) -> None:
         map_database(database, images, tmp_path / "some")
 
 
-def test_no_model(database: Path, images: Path, tmp_path: Path) -> None:
-    """Pairs enough for a start, but none wide enough: nothing is left but the log."""
-    flat = tmp_path / "flat.db"
-    shutil.copyfile(database, flat)
-    with sqlite3.connect(flat) as connection:
-        # No pair has the inliers to start with, nor the images the points to follow.
+def test_failure_to_map_leaves_only_a_log(database: Path, images: Path, tmp_path: Path) -> None:
+    """The pairs have too few inliers to start a model."""
+    few = tmp_path / "few.db"
+    shutil.copyfile(database, few)
+    with sqlite3.connect(few) as connection:
         for table in ("two_view_geometries", "matches"):
             connection.execute(
                 f"UPDATE {table} SET rows = 20, data = substr(data, 1, 20 * 8) WHERE rows > 20"
             )
-        left = connection.execute("SELECT SUM(rows) FROM two_view_geometries").fetchone()[0]
+        num_inliers = connection.execute("SELECT SUM(rows) FROM two_view_geometries").fetchone()[0]
     connection.close()
-    assert left > 0
+    assert num_inliers > 0
     with pytest.raises(ModelError, match="no model") as failed:
-        map_database(flat, images, tmp_path / "model")
-    assert [p.name for p in tmp_path.iterdir()] == ["flat.db"]
+        map_database(few, images, tmp_path / "model")
+    assert [p.name for p in tmp_path.iterdir()] == ["few.db"]
     log = re.search(r"\S+\.log", str(failed.value))
     assert log is not None
     Path(log[0]).unlink()
 
 
-def test_two_at_once_into_one_folder(database: Path, images: Path, tmp_path: Path) -> None:
-    """The one that ends first writes its model; the other one says why it cannot."""
-    output, waiting = tmp_path / "model", [True]
+def test_second_run_into_one_folder_fails_if_another_ends_first(
+    database: Path, images: Path, tmp_path: Path
+) -> None:
+    output, is_waiting = tmp_path / "model", [True]
 
-    def map_beside(*_: object) -> None:
-        if waiting:
-            waiting.clear()
+    def map_meanwhile(*_: object) -> None:
+        if is_waiting:
+            is_waiting.clear()
             map_database(database, images, output)
 
     with pytest.raises(ModelError, match="not empty"):
-        map_database(database, images, output, progress=map_beside)
+        map_database(database, images, output, progress=map_meanwhile)
     assert [p.name for p in tmp_path.iterdir()] == ["model"]
     assert read_model(output / "0").num_reg_images() == NUM_IMAGES
 
@@ -216,7 +220,7 @@ def test_interrupt_leaves_nothing(database: Path, images: Path, tmp_path: Path) 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_command(
+def test_command_reports_the_model_and_refuses_an_existing_folder(
     database: Path, images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["map", "--database_path", str(database), "--image_path", str(images)]

@@ -1,3 +1,5 @@
+"""Cropped, rotated, trimmed and non-square videos: images and keypoints as players show them."""
+
 from __future__ import annotations
 
 import sqlite3
@@ -36,7 +38,7 @@ from colmap_av1.video.display import (
 )
 from colmap_av1.video.facts import read_video
 
-# The presets choose tracks by cells of the picture, which are not those of a cut or scaled one.
+# The presets choose tracks by cells of the picture, which differ in cropped or scaled pictures.
 PAIRS = VerifyOptions(verify="pairs")
 ALL_TRACKS = MatchOptions(density=DensityOptions(preset="dense"), verify=PAIRS)
 TURNS = [
@@ -51,13 +53,15 @@ def keypoints(database: Path) -> list[np.ndarray]:
     return list(keypoints_of(database).values())
 
 
-def cut_by_ffmpeg(ffmpeg: Ffmpeg, video: Path, folder: Path, *how: str) -> list[np.ndarray]:
+def images_of_ffmpeg(ffmpeg: Ffmpeg, video: Path, folder: Path, *words: str) -> list[np.ndarray]:
+    """Write the frames of a video to a folder with ffmpeg, and read them."""
     folder.mkdir()
-    ffmpeg("-i", video, *how, folder / "%04d.png")
+    ffmpeg("-i", video, *words, folder / "%04d.png")
     return [cv2.imread(str(path)) for path in sorted(folder.iterdir())]
 
 
 def boxes(data: bytes, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
+    """Start, size and type of the MP4 boxes in a range of bytes."""
     while start < end:
         size = int.from_bytes(data[start : start + 4], "big")
         yield start, size, data[start + 4 : start + 8]
@@ -67,10 +71,10 @@ def boxes(data: bytes, start: int, end: int) -> Iterator[tuple[int, int, bytes]]
 def with_clean_aperture(
     data: bytes, size: tuple[int, int], crop: tuple[int, int, int, int]
 ) -> bytes:
-    """An MP4 file, its index at the end, with a 'clap' box (ISO/IEC 14496-12, 12.1.4)."""
+    """Add a 'clap' box (ISO/IEC 14496-12, 12.1.4) to an MP4 file with its index at the end."""
     left, top, right, bottom = crop
     width, height = size[0] - left - right, size[1] - top - bottom
-    # Width, height and the offset of the middle as fractions.
+    # Width, height and the offset of the centre, as fractions.
     values = (width, 1, height, 1, left - right, 2, top - bottom, 2)
     clap = struct.pack(">I4s8i", 40, b"clap", *values)
     start, end = 0, len(data)
@@ -93,14 +97,14 @@ def with_clean_aperture(
     st.tuples(*[st.integers(0, 3)] * 4),
     st.tuples(st.integers(8, 12), st.integers(8, 12)),
 )
-def test_points_stay_on_their_pixels(
+def test_points_move_with_their_pixels(
     turn: tuple[tuple[int, int], tuple[int, int]],
     crop: tuple[int, int, int, int],
     size: tuple[int, int],
 ) -> None:
     width, height = size
     display = Display(crop, turn)
-    # Every pixel holds its own place.
+    # The value of each pixel is its position.
     y, x = np.mgrid[:height, :width]
     stored = np.stack([x, y, np.zeros_like(x)], axis=2).astype(np.uint8)
     shown = shown_picture(stored, display)
@@ -113,7 +117,7 @@ def test_points_stay_on_their_pixels(
     np.testing.assert_array_equal(shown[row, column, :2], centres[inside] - 0.5)
 
 
-def test_matrix_that_is_no_quarter_turn() -> None:
+def test_turn_of_matrix_accepts_only_quarter_turns() -> None:
     one = 1 << 16
     assert turn_of_matrix([0, one, 0, -one, 0, 0, 0, 0, 1 << 30]) == ((0, -1), (1, 0))
     assert turn_of_matrix([2 * one, 0, 0, 0, one, 0, 0, 0, 1 << 30]) == ((1, 0), (0, 1))
@@ -124,25 +128,26 @@ def test_matrix_that_is_no_quarter_turn() -> None:
 
 @pytest.mark.parametrize("angle", [0, 90, 180, 270])
 @pytest.mark.parametrize("flip", [[], ["-display_hflip"]])
-def test_pictures_and_keypoints_are_where_ffmpeg_shows_them(
+def test_rotated_pictures_agree_with_ffmpeg_and_tracks_with_pictures(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, angle: int, flip: list[str]
 ) -> None:
-    how = ["-display_rotation", str(angle), *flip]
-    turned = ffmpeg(*how, "-i", clip, "-c", "copy", tmp_path / "turned.mp4")
+    words = ["-display_rotation", str(angle), *flip]
+    turned = ffmpeg(*words, "-i", clip, "-c", "copy", tmp_path / "turned.mp4")
     display = read_video(turned).display
     assert display.is_mirrored == bool(flip)
-    assert angle == (display.rotation if not flip else angle)
+    if not flip:
+        assert display.rotation == angle
     stored = next(decode_frames(clip))[1]
-    (first,) = cut_by_ffmpeg(ffmpeg, turned, tmp_path / "cut", "-frames:v", "1")
+    (first,) = images_of_ffmpeg(ffmpeg, turned, tmp_path / "cut", "-frames:v", "1")
     shown = next(decode_frames(turned))[1]
     np.testing.assert_array_equal(shown, shown_picture(stored, display))
-    # FFmpeg's and PyAV's ways from YUV to RGB round differently.
+    # FFmpeg and PyAV round differently when they convert YUV to RGB.
     assert np.abs(shown.astype(int) - first.astype(int)).mean() < 2
 
     tracks = build_tracks(read_motion(clip))
     moved = tracks.as_displayed(display)
     np.testing.assert_array_equal(moved.offsets, tracks.offsets)
-    # Tracks start between four pixels; these are the same before and after.
+    # Tracks start at the corner of four pixels, which must be the same before and after.
     starts = tracks.frame == 0
     around = [
         np.sort([picture[row + i, column + j] for i in (-1, 0) for j in (-1, 0)], axis=0)
@@ -153,7 +158,7 @@ def test_pictures_and_keypoints_are_where_ffmpeg_shows_them(
     np.testing.assert_array_equal(around[0], around[1])
 
 
-def test_turn_by_other_angles_is_refused(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_rotation_by_other_angles_is_refused(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     turned = ffmpeg("-display_rotation", "30", "-i", clip, "-c", "copy", tmp_path / "turned.mp4")
     with pytest.raises(VideoError, match="90 degrees"):
         match(tmp_path / "a.db", turned)
@@ -162,7 +167,7 @@ def test_turn_by_other_angles_is_refused(clip: Path, ffmpeg: Ffmpeg, tmp_path: P
 
 @pytest.mark.parametrize("ending", ["mp4", "mkv"])
 @pytest.mark.parametrize("angle", [0, 90])
-def test_cropped_by_the_container(
+def test_cropping_by_the_container_is_applied(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, ending: str, angle: int
 ) -> None:
     crop = (12, 4, 20, 10)
@@ -177,7 +182,7 @@ def test_cropped_by_the_container(
         cropped = ffmpeg("-i", cropped, "-c", "copy", tmp_path / "cropped.mkv")
     assert read_video(cropped).display.crop == crop
     assert read_info(cropped).display.crop == crop
-    first, *_ = cut_by_ffmpeg(ffmpeg, cropped, tmp_path / "cut", "-frames:v", "1")
+    first, *_ = images_of_ffmpeg(ffmpeg, cropped, tmp_path / "cut", "-frames:v", "1")
     shown = next(decode_frames(cropped))[1]
     assert shown.shape == first.shape == ((160, 114, 3) if angle else (114, 160, 3))
     assert np.abs(shown.astype(int) - first.astype(int)).mean() < 2
@@ -191,14 +196,16 @@ def test_cropped_by_the_container(
     plain = build_tracks(read_motion(clip)).xy
     for xy in keypoints(tmp_path / "a.db"):
         assert np.all((xy >= 0) & (xy <= size))
-        # Back in the stored picture, they are places that tracks have there.
+        # Moved back to the stored picture, each keypoint is an observation of a track.
         x, y = xy.T if not angle else (size[1] - xy[:, 1], xy[:, 0])
         back = np.stack([x + crop[0], y + crop[1]], axis=1)
         distance = np.abs(plain[None, :] - back[:50, None]).sum(axis=2).min(axis=1)
         assert distance.max() < 1e-3
 
 
-def test_metadata_that_looks_like_cropping(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_metadata_that_looks_like_cropping_is_ignored(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
     words = "x\n    Side data:\n      Frame Cropping: 8/8/8/8"
     odd = ffmpeg(
         *("-i", clip, "-c", "copy", "-metadata:s:v", f"handler_name={words}"), tmp_path / "odd.mp4"
@@ -206,20 +213,20 @@ def test_metadata_that_looks_like_cropping(clip: Path, ffmpeg: Ffmpeg, tmp_path:
     assert read_video(odd).display.crop == (0, 0, 0, 0)
 
 
-def test_edit_list_of_a_trimmed_clip(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_edit_list_of_a_trimmed_clip_is_applied(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     trimmed = ffmpeg("-ss", "0.2", "-i", clip, "-c", "copy", tmp_path / "trimmed.mp4")
     assert read_video(clip).presented is None
     presented = read_video(trimmed).presented
     assert presented is not None
     assert presented.tolist() == list(range(5, 16))
     assert read_info(trimmed).num_cut == 5
-    cut = cut_by_ffmpeg(ffmpeg, trimmed, tmp_path / "cut")
+    cut = images_of_ffmpeg(ffmpeg, trimmed, tmp_path / "cut")
     decoded = list(decode_frames(trimmed))
     assert [index for index, _ in decoded] == list(range(len(cut))) == list(range(11))
     for (_, ours), theirs in zip(decoded, cut, strict=True):
         assert np.abs(ours.astype(int) - theirs.astype(int)).mean() < 2
 
-    # Images are the frames that players show, but tracks began before.
+    # Images are the frames that players show, but tracks may begin in earlier frames.
     tracks = build_tracks(read_motion(clip))
     shown = tracks.as_displayed(Display(), presented)
     assert shown.num_frames == 11
@@ -231,11 +238,13 @@ def test_edit_list_of_a_trimmed_clip(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path)
         assert report.num_frames == report.num_images == 11
         for index, xy in enumerate(keypoints(tmp_path / f"{name}.db")):
             assert len(xy) > 300
-            places = set(map(tuple, tracks.xy[tracks.frame == index + 5].tolist()))
-            assert places.issuperset(map(tuple, xy.tolist()))
+            observed = set(map(tuple, tracks.xy[tracks.frame == index + 5].tolist()))
+            assert observed.issuperset(map(tuple, xy.tolist()))
 
 
-def test_edit_list_of_a_clip_with_b_frames(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_edit_list_of_a_clip_with_b_frames_is_applied(
+    encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
     how = ["-c:v", "libx264", "-bf", "3", "-g", "100", "-crf", "18"]
     phone = encode(make_frames(24), tmp_path / "phone.mp4", *how)
     trimmed = ffmpeg("-ss", "0.28", "-i", phone, "-c", "copy", tmp_path / "trimmed.mp4")
@@ -249,12 +258,11 @@ def test_edit_list_of_a_clip_with_b_frames(encode: Encode, ffmpeg: Ffmpeg, tmp_p
     assert report.num_coded_frames == 24
     for name, image in zip(sorted((tmp_path / "images").iterdir()), expected, strict=True):
         np.testing.assert_array_equal(cv2.imread(str(name)), image)
-    # Keypoints lie on the pictures' content: the layers move by 2 and 4 px a frame.
     check_motion(tmp_path / "a.db")
 
 
 def check_motion(database: Path) -> None:
-    """Steps between neighbours are 2 or 4 px to the left, as the layers move."""
+    """Check that keypoints move 2 or 4 px to the left per image, like the layers of the scene."""
     with sqlite3.connect(database) as connection:
         rows = connection.execute("SELECT pair_id, rows, data FROM matches").fetchall()
         ids = [i for (i,) in connection.execute("SELECT image_id FROM images ORDER BY image_id")]
@@ -272,7 +280,9 @@ def check_motion(database: Path) -> None:
 
 
 @pytest.mark.parametrize("angle", [0, 90])
-def test_oblong_pixels(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, angle: int) -> None:
+def test_non_square_pixels_get_a_camera_with_two_focal_lengths(
+    encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, angle: int
+) -> None:
     clip = encode(make_frames(10), tmp_path / "c.mp4", *AV1, "-vf", "setsar=3/2")
     turned = ffmpeg("-display_rotation", str(angle), "-i", clip, "-c", "copy", tmp_path / "t.mp4")
     aspect = 1.5 if angle == 0 else 1 / 1.5
@@ -287,10 +297,10 @@ def test_oblong_pixels(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, angle: in
         ).fetchone()
     fx, fy, *_ = np.frombuffer(params)
     assert (model, prior) == (4, 0)  # OPENCV
-    # As far as the picture is shown, 288x128 or turned, it is the usual guess.
+    # In square pixels, 288x128 or rotated, this is the usual assumed focal length.
     assert (fx * aspect, fy) == pytest.approx((0.9 * 288 / 1.5 * (1.5 if angle == 0 else 1),) * 2)
-    # Images keep stored pixels, as ffmpeg cuts them.
-    (first,) = cut_by_ffmpeg(ffmpeg, turned, tmp_path / "cut", "-frames:v", "1")
+    # Images keep the stored pixels, like those that ffmpeg writes.
+    (first,) = images_of_ffmpeg(ffmpeg, turned, tmp_path / "cut", "-frames:v", "1")
     written = cv2.imread(str(tmp_path / "images" / "frame_000000.png"))
     assert written.shape == first.shape
 
@@ -303,11 +313,11 @@ def info_rows(video: Path) -> list[tuple[str, str]]:
     return reports.info_rows(read_info(video))
 
 
-def test_images_whose_pixels_were_made_square(
+def test_keypoints_fit_images_scaled_to_square_pixels(
     encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path
 ) -> None:
     clip = encode(make_frames(10), tmp_path / "c.mp4", *AV1, "-vf", "setsar=3/2")
-    cut_by_ffmpeg(ffmpeg, clip, tmp_path / "cut", "-vf", "scale=288:128,setsar=1")
+    images_of_ffmpeg(ffmpeg, clip, tmp_path / "cut", "-vf", "scale=288:128,setsar=1")
     report = match(tmp_path / "a.db", clip, image_path=tmp_path / "cut", options=ALL_TRACKS)
     assert (report.num_images, report.num_written_images, report.warnings) == (10, 0, ())
     with sqlite3.connect(tmp_path / "a.db") as connection:
@@ -321,8 +331,10 @@ def test_images_whose_pixels_were_made_square(
         np.testing.assert_allclose(square, stored * [1.5, 1], atol=1e-4)
 
 
-def test_superres(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
-    """Pictures are coded narrower than they are shown; motion is that of the shown ones."""
+def test_superres_tracks_are_in_pixels_of_the_upscaled_picture(
+    encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """With superres, pictures are coded with a smaller width."""
     rng = np.random.default_rng(3)
     scene = cv2.GaussianBlur(rng.integers(0, 256, (128, 400, 3), dtype=np.uint8), (0, 0), 3)
     scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
@@ -332,12 +344,12 @@ def test_superres(encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     clip = encode(pan, tmp_path / "clip.mp4", *how)
     assert 171 in {frame.header["frame_width"] for frame in read_motion(clip)}
     tracks = build_tracks(read_motion(clip))
-    next_one = (np.diff(tracks.frame) == 1) & (np.diff(tracks.xy[:, 1]) < 1)
-    steps = np.diff(tracks.xy, axis=0)[next_one]
+    is_next = (np.diff(tracks.frame) == 1) & (np.diff(tracks.xy[:, 1]) < 1)
+    steps = np.diff(tracks.xy, axis=0)[is_next]
     assert np.median(steps[:, 0]) == pytest.approx(-6, abs=0.3)
     assert tracks.xy[:, 0].max() > 200
     match(tmp_path / "a.db", clip, image_path=tmp_path / "images")
-    (first,) = cut_by_ffmpeg(ffmpeg, clip, tmp_path / "cut", "-frames:v", "1")
+    (first,) = images_of_ffmpeg(ffmpeg, clip, tmp_path / "cut", "-frames:v", "1")
     written = cv2.imread(str(tmp_path / "images" / "frame_000000.png"))
     assert written.shape == first.shape == (128, 256, 3)
     assert read_video(clip).display.pixel_aspect == pytest.approx(1, abs=5e-3)

@@ -1,3 +1,5 @@
+"""Conversion of videos to AV1 streams for matching."""
+
 from __future__ import annotations
 
 import os
@@ -54,7 +56,7 @@ def times(video: Path) -> list[float]:
 
 @pytest.mark.parametrize("encoder", ["libaom", "svt"])
 @pytest.mark.parametrize("ending", ["mp4", "mkv"])
-def test_streams_refer_backwards_only(
+def test_frames_refer_only_to_earlier_frames(
     phone: Path, tmp_path: Path, encoder: str, ending: str
 ) -> None:
     done: list[tuple[str, int, int | None]] = []
@@ -62,7 +64,7 @@ def test_streams_refer_backwards_only(
         phone,
         tmp_path / f"out.{ending}",
         options=EncodeOptions(encoder=encoder),
-        progress=lambda *what: done.append(what),
+        progress=lambda *step: done.append(step),
     )
     assert report.num_frames == 12
     assert done[0] == ("encoding", 0, 12)
@@ -74,11 +76,12 @@ def test_streams_refer_backwards_only(
         assert f.ref_display_index[1:].max() < max(f.display_index, 1)
     np.testing.assert_allclose(times(report.output), times(phone), atol=2e-3)
     assert [p.name for p in tmp_path.iterdir()] == [f"out.{ending}"]
-    # Motion to the frame before is what makes good tracks.
+    # Good tracks need motion vectors that refer to the previous frame.
     assert read_info(report.output).reference_distances[-1] > 0.6
 
 
-def test_speeds_of_libaom_that_ffmpeg_does_not_have(phone: Path, tmp_path: Path) -> None:
+def test_libaom_speeds_above_8_change_the_stream(phone: Path, tmp_path: Path) -> None:
+    """ffmpeg's own option for the speed of libaom ends at 8."""
     streams = []
     for speed in (8, 10):
         options = EncodeOptions(encoder="libaom", speed=speed)
@@ -90,8 +93,9 @@ def test_speeds_of_libaom_that_ffmpeg_does_not_have(phone: Path, tmp_path: Path)
         find_encoder(EncodeOptions(encoder="libaom", speed=99))
 
 
-def test_quick_conversions(phone: Path, tmp_path: Path) -> None:
-    """They are used again unless full ones are asked for."""
+def test_quick_stream_is_reused_unless_full_effort_is_requested(
+    phone: Path, tmp_path: Path
+) -> None:
     quick, full = (EncodeOptions("libaom", effort=effort) for effort in ("quick", "full"))
     stream = tmp_path / "stream.mp4"
     assert not stream_of(phone, stream, options=quick).reused
@@ -103,10 +107,10 @@ def test_quick_conversions(phone: Path, tmp_path: Path) -> None:
     assert stream_of(phone, stream, options=quick).reused
 
 
-def test_programs_that_do_not_have_an_encoder_are_not_probed(
+def test_each_ffmpeg_is_asked_once_for_its_encoders(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each further one is asked once for what it has."""
+    """Encoders that it does not have are not tried."""
     (tmp_path / "bin").mkdir()
     called = tmp_path / "called"
     script = f'echo "$*" >> {called}; case "$*" in *-encoders*) echo libsvtav1; exit;; esac'
@@ -118,7 +122,9 @@ def test_programs_that_do_not_have_an_encoder_are_not_probed(
     assert ["libsvtav1" in line for line in called.read_text().splitlines()] == [False, True]
 
 
-def test_pictures_are_those_of_the_video(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_converted_pictures_look_like_those_of_a_rotated_video(
+    phone: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
     turned = ffmpeg("-display_rotation", "90", "-i", phone, "-c", "copy", tmp_path / "t.mp4")
     report = encode_video(turned, tmp_path / "out.mp4", options=EncodeOptions(quality=5))
     for (_, before), (_, after) in zip(
@@ -139,10 +145,10 @@ def test_varying_frame_rate_keeps_every_frame(phone: Path, ffmpeg: Ffmpeg, tmp_p
 
 
 @pytest.mark.parametrize("encoder", ["libaom", "svt"])
-def test_ten_bits_of_high_dynamic_range(
+def test_ten_bit_hdr_video_is_converted_and_matched(
     encode: Encode, ffmpeg: Ffmpeg, tmp_path: Path, encoder: str
 ) -> None:
-    """As newer phones film, 60 frames a second."""
+    """A video like those of newer phones, with 60 frames per second."""
     plain = encode(make_frames(12, 96, 64), tmp_path / "plain.mkv", "-c:v", "ffv1")
     colours = "setparams=colorspace=bt2020nc:color_primaries=bt2020:color_trc=smpte2084"
     video = ffmpeg(
@@ -160,7 +166,7 @@ def test_ten_bits_of_high_dynamic_range(
     for (_, before), (_, after) in zip(
         decode_frames(video), decode_frames(report.output), strict=True
     ):
-        # Colours may be read by other rules: what matters is where things are.
+        # Decoders convert these colours differently, but matching only needs the structure.
         grey = [cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) for picture in (before, after)]
         assert np.corrcoef(grey[0].ravel(), grey[1].ravel())[0, 1] > 0.98
     found = match(tmp_path / "a.db", video, options=MatchOptions(encode=options))
@@ -172,7 +178,7 @@ def test_ten_bits_of_high_dynamic_range(
 
 
 def test_slow_motion_keeps_every_frame(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
-    """240 frames a second, some of which a phone left out."""
+    """The video has 240 frames per second and a gap of two frames."""
     video = ffmpeg(
         *("-i", phone, "-vf", "setpts=(N+2*gt(N\\,5))/240/TB", "-fps_mode", "passthrough"),
         *("-enc_time_base", "1/24000", *H264, tmp_path / "slow.mov"),
@@ -185,13 +191,15 @@ def test_slow_motion_keeps_every_frame(phone: Path, ffmpeg: Ffmpeg, tmp_path: Pa
 
 
 @pytest.mark.parametrize("encoder", ["libaom", "svt"])
-def test_odd_sizes(encode: Encode, tmp_path: Path, encoder: str) -> None:
+def test_odd_sizes_are_kept(encode: Encode, tmp_path: Path, encoder: str) -> None:
     source = encode(make_frames(4, 97, 65), tmp_path / "odd.mkv", "-c:v", "ffv1")
     report = encode_video(source, tmp_path / "out.mp4", options=EncodeOptions(encoder=encoder))
     assert {image.shape for _, image in decode_frames(report.output)} == {(65, 97, 3)}
 
 
-def test_stream_is_kept_and_used_again(phone: Path, tmp_path: Path) -> None:
+def test_stream_is_reused_until_the_settings_or_the_video_change(
+    phone: Path, tmp_path: Path
+) -> None:
     video = Path(shutil.copy(phone, tmp_path / "phone.mov"))
     stream = tmp_path / "stream.mp4"
     first = stream_of(video, stream)
@@ -200,24 +208,25 @@ def test_stream_is_kept_and_used_again(phone: Path, tmp_path: Path) -> None:
     bytes_before = first.output.read_bytes()
     assert stream_of(video, stream).reused
     assert stream_of(video, stream, options=EncodeOptions(quality=20)).reused
-    # Made with other settings, cut off, or older than the video: made again.
     assert not stream_of(video, stream, options=EncodeOptions(quality=40)).reused
     assert not stream_of(video, stream, options=EncodeOptions(quality=20)).reused
     assert first.output.read_bytes() == bytes_before
+    # A truncated stream is not recognized as one of this package, so it is not replaced.
     first.output.write_bytes(bytes_before[: len(bytes_before) // 2])
     with pytest.raises(OptionError, match="exists"):
         stream_of(video, stream)
     first.output.unlink()
     stream_of(video, stream)
+    # A stream older than the video is encoded again.
     os.utime(first.output, (0, 0))
     assert not stream_of(video, stream).reused
 
 
-def test_stream_of_another_video_is_not_taken(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+def test_stream_of_another_video_is_not_reused(phone: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     video = Path(shutil.copy(phone, tmp_path / "phone.mp4"))
     stream = tmp_path / "stream.mp4"
     stream_of(video, stream)
-    # As many frames, and older than the stream.
+    # This video has as many frames and is older than the stream.
     other = ffmpeg("-i", phone, "-vf", "hflip", *H264, tmp_path / "phone.mov")
     os.utime(other, (0, 0))
     assert not stream_of(other, stream).reused
@@ -226,12 +235,12 @@ def test_stream_of_another_video_is_not_taken(phone: Path, ffmpeg: Ffmpeg, tmp_p
         stream_of(video, tmp_path / "out.ivf")
 
 
-def test_stream_of_a_raw_video_is_not_taken_for_another(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
-    """Without compression, videos of one shape have one size."""
+def test_stream_of_a_raw_video_is_not_reused_for_another(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """Uncompressed videos with the same resolution and length have the same file size."""
     videos = []
     for change in ("null", "hflip"):
-        how = ["-f", "lavfi", "-i", "testsrc=s=64x64:r=25", "-frames:v", "4", "-vf", change]
-        videos.append(ffmpeg(*how, "-pix_fmt", "yuv420p", tmp_path / f"{change}.y4m"))
+        words = ["-f", "lavfi", "-i", "testsrc=s=64x64:r=25", "-frames:v", "4", "-vf", change]
+        videos.append(ffmpeg(*words, "-pix_fmt", "yuv420p", tmp_path / f"{change}.y4m"))
         os.utime(videos[-1], (0, 0))
     assert videos[0].stat().st_size == videos[1].stat().st_size
     stream = tmp_path / "stream.mp4"
@@ -240,7 +249,7 @@ def test_stream_of_a_raw_video_is_not_taken_for_another(ffmpeg: Ffmpeg, tmp_path
     assert not stream_of(videos[1], stream).reused
 
 
-def test_files_of_others_are_not_replaced(phone: Path, tmp_path: Path) -> None:
+def test_files_that_are_not_streams_are_not_replaced(phone: Path, tmp_path: Path) -> None:
     video = Path(shutil.copy(phone, tmp_path / "phone.mp4"))
     other = tmp_path / "other.mp4"
     shutil.copy(phone, other)
@@ -254,15 +263,15 @@ def test_files_of_others_are_not_replaced(phone: Path, tmp_path: Path) -> None:
     assert encode_video(video, other, overwrite=True).num_frames == 12
 
 
-def test_match_takes_any_codec(phone: Path, tmp_path: Path) -> None:
+def test_match_accepts_any_codec(phone: Path, tmp_path: Path) -> None:
     video = Path(shutil.copy(phone, tmp_path / "phone.mp4"))
-    stream = tmp_path / "elsewhere.mp4"
+    stream = tmp_path / "stream.mp4"
     options = MatchOptions(keep_stream=str(stream))
     report = match(tmp_path / "a.db", video, image_path=tmp_path / "frames", options=options)
     assert report.streams == (stream,)
     assert report.num_images == 12
     assert report.num_verified_pairs > 0
-    # The pictures are the video's own, not those of the stream.
+    # The images are decoded from the video, not from the stream.
     for index, picture in decode_frames(video):
         written = cv2.imread(str(tmp_path / "frames" / f"frame_{index:06d}.png"))
         np.testing.assert_array_equal(written, picture)
@@ -270,17 +279,17 @@ def test_match_takes_any_codec(phone: Path, tmp_path: Path) -> None:
     assert again.num_matches == report.num_matches
 
 
-def test_nothing_is_left_of_a_conversion(phone: Path, tmp_path: Path) -> None:
-    """Neither beside the video nor beside the database."""
+def test_temporary_stream_is_removed(phone: Path, tmp_path: Path) -> None:
+    """During the match, it lies next to the database."""
     (tmp_path / "videos").mkdir()
     video = Path(shutil.copy(phone, tmp_path / "videos" / "phone.mp4"))
     (tmp_path / "work").mkdir()
     seen: set[str] = set()
 
-    def look(stage: str, done: int, total: int | None) -> None:
+    def list_files(stage: str, done: int, total: int | None) -> None:
         seen.update(p.name for p in (tmp_path / "work").iterdir() if stage == "motion")
 
-    report = match(tmp_path / "work" / "a.db", video, progress=look)
+    report = match(tmp_path / "work" / "a.db", video, progress=list_files)
     assert report.streams == (None,)
     assert report.num_images == 12
     assert len(seen) == 1
@@ -288,14 +297,14 @@ def test_nothing_is_left_of_a_conversion(phone: Path, tmp_path: Path) -> None:
     assert list(video.parent.iterdir()) == [video]
 
 
-def test_reencode_only_what_is_poor(
+def test_only_poor_av1_streams_are_reencoded(
     clip: Path, encode: Encode, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     how = ("-c:v", "libaom-av1", "-cpu-used", "8", "-g", "1", "-crf", "20")
     intra = encode(make_frames(8), tmp_path / "intra.mp4", *how)
     assert not read_info(intra).good
     words = ["match", "--database", str(tmp_path / "a.db"), "--video", str(intra)]
-    # The pictures link what no motion does; a warning says what the stream lacks.
+    # Without motion vectors, SIFT links join the images, and a warning suggests to reencode.
     assert main(words) == 0
     assert "--reencode 1" in capsys.readouterr().err
     (tmp_path / "a.db").unlink()
@@ -306,8 +315,8 @@ def test_reencode_only_what_is_poor(
     assert good.streams == (clip,)
 
 
-def hurt(video: Path, output: Path, packet: int) -> Path:
-    """A copy of an MP4 file in which a packet, counted as coded, cannot be decoded."""
+def damage(video: Path, output: Path, packet: int) -> Path:
+    """Copy an MP4 file, and damage the packet with this index in coding order."""
     with av.open(str(video)) as container:
         coded = [p for p in container.demux(video=0) if p.size][packet]
         start, end = coded.pos, coded.pos + coded.size
@@ -320,10 +329,10 @@ def hurt(video: Path, output: Path, packet: int) -> Path:
 def test_damaged_video_is_used_up_to_the_damage(
     encode: Encode, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # Without B frames, so that packets come in the order of the pictures.
+    # Without B frames, the packets are in display order.
     how = ("-c:v", "libx264", "-g", "6", "-bf", "0")
     whole = encode(make_frames(24, 96, 64), tmp_path / "whole.mp4", *how)
-    video = hurt(whole, tmp_path / "video.mp4", 13)
+    video = damage(whole, tmp_path / "video.mp4", 13)
     with pytest.warns(UserWarning, match="13 of 24"):
         first = stream_of(video, tmp_path / "stream.mp4")
     assert first.num_frames == len(list(decode_frames(first.output))) == 13
@@ -331,7 +340,7 @@ def test_damaged_video_is_used_up_to_the_damage(
         decode_frames(whole), decode_frames(first.output), strict=False
     ):
         assert cv2.PSNR(before, after) > 30
-    # Nor is the damage forgotten when the stream is used again.
+    # The warning appears again when the stream is reused.
     with pytest.warns(UserWarning, match="13 of 24"):
         again = stream_of(video, first.output)
     assert again.reused
@@ -349,7 +358,7 @@ def test_damaged_video_is_used_up_to_the_damage(
     assert not list(tmp_path.glob(".*"))
 
 
-def test_frames_are_counted_where_the_container_does_not(
+def test_frames_are_counted_if_the_container_does_not_store_their_number(
     phone: Path, ffmpeg: Ffmpeg, tmp_path: Path
 ) -> None:
     video = ffmpeg("-i", phone, "-c", "copy", tmp_path / "phone.ts")
@@ -359,22 +368,22 @@ def test_frames_are_counted_where_the_container_does_not(
     assert done[-1] == ("encoding", 12, 12)
 
 
-def test_video_that_changes(phone: Path, tmp_path: Path) -> None:
-    """As one does that is still copied from the phone."""
+def test_video_that_changes_during_conversion_is_refused(phone: Path, tmp_path: Path) -> None:
+    """For example, the video is still being copied from the phone."""
     video = tmp_path / "v.mov"
     shutil.copyfile(phone, video)
 
-    def write_on(stage: str, done: int, total: int | None) -> None:
+    def append(stage: str, done: int, total: int | None) -> None:
         if done == 0:
             with video.open("ab") as file:
                 file.write(b"more")
 
     with pytest.raises(VideoError, match="changed"):
-        encode_video(video, tmp_path / "s.mp4", progress=write_on)
+        encode_video(video, tmp_path / "s.mp4", progress=append)
     assert list(tmp_path.iterdir()) == [video]
 
 
-def test_pictures_that_change_their_size(encode: Encode, tmp_path: Path) -> None:
+def test_video_that_changes_its_resolution_is_refused(encode: Encode, tmp_path: Path) -> None:
     video = tmp_path / "video.h264"
     video.write_bytes(
         b"".join(
@@ -389,7 +398,7 @@ def test_pictures_that_change_their_size(encode: Encode, tmp_path: Path) -> None
 
 @pytest.fixture(scope="module")
 def long(ffmpeg: Ffmpeg, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A clip whose conversion takes a while."""
+    """A clip whose conversion takes several seconds."""
     return ffmpeg(
         *("-f", "lavfi", "-i", "testsrc2=size=1280x720:rate=30:duration=5"),
         *("-c:v", "libx264", "-preset", "ultrafast"),
@@ -401,7 +410,13 @@ def long(ffmpeg: Ffmpeg, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def long_conversion(
     clip: Path, folder: Path, words: Sequence[str] = TO_A_FILE
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A process that is converting long.mp4 of a folder to `words`, for some time yet."""
+    """A process that has started to convert a copy of a clip in a folder.
+
+    Args:
+        clip: the clip, which becomes long.mp4.
+        folder: the folder.
+        words: the command and its output.
+    """
     long = shutil.copyfile(clip, folder / "long.mp4")
     words = [*words, "--video", str(long), "--encoder", "libaom", "--speed", "2"]
     command = [sys.executable, "-c", HANDLE_INTERRUPTS, *words]
@@ -414,7 +429,8 @@ def long_conversion(
         yield process
 
 
-def is_converted(video: Path) -> bool:
+def is_being_converted(video: Path) -> bool:
+    """Whether a running process has the video among its arguments."""
     running = subprocess.run(
         ["ps", "-ww", "-eo", "args"], capture_output=True, text=True, check=True
     )
@@ -430,18 +446,18 @@ def test_interrupted_conversion_leaves_nothing(
         process.send_signal(number)
         assert process.wait(30) == status
     assert [p.name for p in tmp_path.iterdir()] == ["long.mp4"]
-    assert not is_converted(tmp_path / "long.mp4")
+    assert not is_being_converted(tmp_path / "long.mp4")
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
-def test_killed_conversion_ends_and_is_cleaned_up_after(
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can end a child with its parent")
+def test_encoder_of_a_killed_conversion_ends_and_the_next_run_cleans_up(
     phone: Path, long: Path, tmp_path: Path
 ) -> None:
     with long_conversion(long, tmp_path) as process:
         process.kill()
         process.wait(30)
     deadline = time.monotonic() + 10
-    while is_converted(tmp_path / "long.mp4"):
+    while is_being_converted(tmp_path / "long.mp4"):
         assert time.monotonic() < deadline
         time.sleep(0.05)
     assert list(tmp_path.glob(".out.mp4.*.partial"))
@@ -452,12 +468,12 @@ def test_killed_conversion_ends_and_is_cleaned_up_after(
     assert {p.name for p in tmp_path.iterdir()} == {"long.mp4", "out.mp4", *others}
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of the killed")
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can end a child with its parent")
 @pytest.mark.parametrize("next_video", ["phone", "clip"])
-def test_killed_match_is_cleaned_up_after(
+def test_next_match_removes_the_files_of_a_killed_one(
     next_video: str, long: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """By the next run on that database, whether it converts its video or not."""
+    """The next match with the same database does so even if it converts no video."""
     video = request.getfixturevalue(next_video)
     with long_conversion(long, tmp_path, TO_A_DATABASE) as process:
         process.kill()
@@ -469,15 +485,15 @@ def test_killed_match_is_cleaned_up_after(
 
 
 def fake_ffmpeg(folder: Path, script: str) -> Path:
-    """A program that does as the real ffmpeg does, until `script` says otherwise."""
+    """Write a shell program that runs `script` and, unless that exits, the real ffmpeg."""
     path = folder / "ffmpeg"
     path.write_text(f'#!/bin/sh\n{script}\nexec {imageio_ffmpeg.get_ffmpeg_exe()} "$@"\n')
     path.chmod(0o755)
     return path
 
 
-# What is asked of hardware encoders: by quality 20, that is quantiser index 81 of 255, each frame
-# from those before it.
+# Options of hardware encoders for quality 20, which is quantizer index 81 of 255. They forbid
+# references to later frames.
 HARDWARE = {
     "nvenc": "-tune hq -preset p1 -rc constqp -qp 81 -b_ref_mode 0 -bf 0",
     "qsv": "-preset 7 -q:v 81 -bf 0 -low_delay_brc 1",
@@ -485,7 +501,7 @@ HARDWARE = {
     "vaapi": "-compression_level 7 -rc_mode CQP -global_quality 81 -bf 0",
 }
 PICTURES = {"nvenc": "format=yuv420p", "vaapi": "format=nv12,hwupload"}
-# Those that ffmpeg has for every encoder.
+# Options that ffmpeg has for every encoder.
 OF_ALL_ENCODERS = {"-bf", "-q:v", "-global_quality", "-compression_level"}
 
 
@@ -494,7 +510,7 @@ OF_ALL_ENCODERS = {"-bf", "-q:v", "-global_quality", "-compression_level"}
     [(None, ""), (2, "scale=w=max(2\\,2*floor(iw/2/2+0.5)):h=max(2\\,2*floor(ih/2/2+0.5)):")],
 )
 @pytest.mark.parametrize("name", HARDWARE)
-def test_what_hardware_encoders_are_asked(
+def test_hardware_encoders_get_these_options(
     phone: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -503,16 +519,16 @@ def test_what_hardware_encoders_are_asked(
     downscale: float | None,
     scaled: str,
 ) -> None:
-    """As on a machine that has the hardware, up to where it would be used."""
-    asked = tmp_path / "asked"
-    log = f'printf "%s\\n" "$@" > {asked}'
+    """A fake ffmpeg claims to have the encoder and logs its arguments instead of encoding."""
+    arguments = tmp_path / "arguments"
+    log = f'printf "%s\\n" "$@" > {arguments}'
     script = f'case "$*" in *lavfi*) exit 0;; *) {log}; exit 1;; esac'
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake_ffmpeg(tmp_path, script)))
     options = EncodeOptions(encoder=name, downscale=downscale)
     with pytest.raises(EncodeError, match="failed"):
         encode_video(phone, tmp_path / "out.mp4", options=options)
     pictures = f"{scaled and f'{scaled}flags=area,'}{PICTURES.get(name, 'format=nv12')}"
-    words = asked.read_text().splitlines()
+    words = arguments.read_text().splitlines()
     device = ["-vaapi_device", "/dev/dri/renderD128"] if name == "vaapi" else []
     assert words[words.index("-y") + 1 : words.index("-i")] == [
         *device,
@@ -526,15 +542,15 @@ def test_what_hardware_encoders_are_asked(
 
 
 @pytest.mark.parametrize("name", HARDWARE)
-def test_hardware_encoders_know_what_they_are_asked(name: str) -> None:
+def test_ffmpeg_knows_the_options_of_hardware_encoders(name: str) -> None:
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-h", f"encoder=av1_{name}"]
-    about = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    if "is not recognized" in about:
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    if "is not recognized" in text:
         pytest.skip(f"this ffmpeg is built without av1_{name}")
     words = HARDWARE[name].split()
     for option, value in zip(words[::2], words[1::2], strict=True):
-        # An option's line, and those of its values, which are indented further.
-        own = re.search(rf"^  {option} .*\n((?:     .*\n)*)", about, re.MULTILINE)
+        # The line of the option, and the lines of its values, which are indented more.
+        own = re.search(rf"^  {option} .*\n((?:     .*\n)*)", text, re.MULTILINE)
         if own is None:
             assert option in OF_ALL_ENCODERS
         elif not value.isdecimal():
@@ -547,7 +563,7 @@ FAIL_HALF_WAY = """case "$*" in *lavfi*) ;; *)
   echo frame=7; echo 'Error submitting a packet to the encoder' >&2; exit 1;; esac"""
 
 
-def test_encoder_that_fails_half_way(
+def test_encoder_that_fails_half_way_is_reported_with_its_frame_count(
     phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "bin").mkdir()
@@ -558,7 +574,9 @@ def test_encoder_that_fails_half_way(
     assert [p.name for p in tmp_path.iterdir()] == ["bin"]
 
 
-def test_full_disk(phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_reported(
+    phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     words = """Svt[info]: ----
     [vost#0:0/libsvtav1 @ 0x55d5b6f68380] [error] Error muxing a packet: No space left"""
     script = f"case \"$*\" in *lavfi*) ;; *) echo '{words} on device' >&2; exit 1;; esac"
@@ -568,7 +586,9 @@ def test_full_disk(phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert [p.name for p in tmp_path.iterdir()] == ["ffmpeg"]
 
 
-def test_no_encoder_at_all(phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_encoder_is_reported(
+    phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     program = fake_ffmpeg(tmp_path, "echo 'Unknown encoder' >&2; exit 1")
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
     monkeypatch.setenv("PATH", "")
@@ -581,14 +601,14 @@ def test_no_encoder_at_all(phone: Path, tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ("names", "error", "message"),
     [
-        (("absent.mp4", "out.mp4"), VideoError, "no such file"),
+        (("missing.mp4", "out.mp4"), VideoError, "no such file"),
         ((".", "out.mp4"), VideoError, "folder"),
         (("text.mp4", "out.mp4"), VideoError, "not a video"),
         (("phone.mp4", "out.avi"), OptionError, r"\.mp4"),
-        (("phone.mp4", "absent/out.mp4"), EncodeError, "folder"),
+        (("phone.mp4", "missing/out.mp4"), EncodeError, "folder"),
     ],
 )
-def test_bad_input(
+def test_bad_paths_are_reported_in_one_line(
     phone: Path,
     tmp_path: Path,
     names: tuple[str, str],
@@ -603,7 +623,9 @@ def test_bad_input(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["phone.mp4", "text.mp4"]
 
 
-def test_video_without_a_decodable_frame(phone: Path, tmp_path: Path) -> None:
+def test_video_without_a_decodable_frame_is_reported_in_one_line(
+    phone: Path, tmp_path: Path
+) -> None:
     data = phone.read_bytes()
     start, end = data.index(b"mdat") + 4, data.index(b"moov")
     assert start < end
