@@ -1,4 +1,4 @@
-"""The page of a model: it opens in a browser without a network and shows what the model holds."""
+"""The page of a model: browsers show it without a network, and it describes the model."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NUM_POINTS = 2000
 
 @pytest.fixture(scope="module")
 def stock_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A model without images and without a report, as a mapper writes it."""
+    """A model as a mapper writes it, without image files and without a report."""
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 8, NUM_POINTS
     reconstruction = pycolmap.synthesize_dataset(options)
@@ -48,12 +48,12 @@ def scene(made: ReconstructReport, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def text_of(page: Path) -> str:
-    """The page without its scripts, and with single spaces."""
+    """The HTML of a page without scripts, and with single spaces."""
     text = re.sub(r"<script.*?</script>", "", page.read_text(), flags=re.DOTALL)
     return " ".join(text.split())
 
 
-def test_page_of_a_reconstruction_in_a_browser(
+def test_browser_shows_the_page_of_a_reconstruction(
     scene: Path, made: ReconstructReport, tmp_path: Path
 ) -> None:
     page = tmp_path / "page.html"
@@ -61,7 +61,7 @@ def test_page_of_a_reconstruction_in_a_browser(
     shown = show(page, tmp_path)
     assert shown.errors == []
     assert page.stat().st_size < 15e6
-    # The 3D view is drawn below the heading and holds many colours, the page around it few.
+    # The 3D view is below the heading and has many colours. The page around it has few.
     view = shown.picture[200:700, 200:1200].reshape(-1, 3)
     assert len(np.unique(view // 16, axis=0)) > 100
     text = text_of(page)
@@ -74,7 +74,9 @@ def test_page_of_a_reconstruction_in_a_browser(
     assert "ns-train" in text
 
 
-def test_page_of_a_stock_mapper_in_a_browser(stock_model: Path, tmp_path: Path) -> None:
+def test_browser_shows_the_page_of_a_model_of_another_mapper(
+    stock_model: Path, tmp_path: Path
+) -> None:
     page = tmp_path / "page.html"
     assert main(["view", "--model", str(stock_model), "--output", str(page)]) == 0
     shown = show(page, tmp_path)
@@ -87,7 +89,7 @@ def test_page_of_a_stock_mapper_in_a_browser(stock_model: Path, tmp_path: Path) 
     assert "colmap-av1 densify" in text
 
 
-def test_a_timeline_shows_gaps_and_what_is_not_registered(
+def test_timeline_shows_gaps_and_images_that_are_not_registered(
     scene: Path, made: ReconstructReport, tmp_path: Path
 ) -> None:
     (own,) = made.timelines
@@ -103,7 +105,7 @@ def test_a_timeline_shows_gaps_and_what_is_not_registered(
     assert "low inter share, few tracks, 20% of the usual matches" in text
 
 
-def test_large_clouds_are_shown_in_part(
+def test_page_shows_a_part_of_a_large_cloud(
     stock_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("colmap_av1.view.page._MOST_POINTS", 500)
@@ -111,19 +113,18 @@ def test_large_clouds_are_shown_in_part(
     assert f"{NUM_POINTS:,} points, 500 of them shown" in text_of(tmp_path / "page.html")
 
 
-def test_a_report_is_read_as_it_was_written(made: ReconstructReport) -> None:
+def test_report_is_read_as_written(made: ReconstructReport) -> None:
     report = read_report(made.output)
     # Another test may have resumed this folder since, with the video at another path.
-    of_run = ("videos", "resumed", "seconds", "cpu_seconds")
-    own_run = {name: getattr(report, name) for name in of_run}
-    assert report == replace(made, **own_run)
+    changed = ("videos", "resumed", "seconds", "cpu_seconds")
+    assert report == replace(made, **{name: getattr(report, name) for name in changed})
     (own,) = report.timelines
     assert len(own.images) == len(own.frames) == made.num_images
     assert len(own.key_images) == made.num_key_images
     assert own.num_frames == made.num_frames
 
 
-def test_a_report_of_another_version_leaves_the_model(
+def test_model_with_a_report_of_another_version_is_shown_without_it(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "older"
@@ -139,21 +140,21 @@ def test_a_report_of_another_version_leaves_the_model(
     assert "<svg" not in text_of(page)
 
 
-def test_what_cannot_be_written(
+def test_page_that_cannot_be_written_is_refused(
     stock_model: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     existing = tmp_path / "page.html"
-    existing.write_text("of somebody")
+    existing.write_text("existing page")
     words = ["view", "--model", str(stock_model), "--output"]
     assert main([*words, str(existing)]) == 2
-    assert existing.read_text() == "of somebody"
+    assert existing.read_text() == "existing page"
     monkeypatch.setitem(sys.modules, "plotly", None)
     with pytest.raises(OptionError, match=r"\[viewer\]"):
         check_page(tmp_path / "new.html")
-    # Before anything is reconstructed.
+    # `reconstruct` fails before it does any work.
     output = tmp_path / "scene"
     words = ["reconstruct", "--video", "none.mp4", "--output", str(output), "--report"]
     assert main(words) == 2
@@ -161,7 +162,7 @@ def test_what_cannot_be_written(
     assert not output.exists()
 
 
-def test_points_of_little_parallax_and_without_an_error_have_no_observable_depth() -> None:
+def test_points_with_little_parallax_or_without_an_error_have_no_observable_depth() -> None:
     model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_points3D=50))
     for point in model.points3D.values():
         point.error = 0.5
@@ -175,7 +176,7 @@ def test_points_of_little_parallax_and_without_an_error_have_no_observable_depth
     assert has_observable_depth(model).sum() == 49
 
 
-def test_the_frame_leaves_out_what_is_not_observable() -> None:
+def test_view_does_not_frame_points_without_observable_depth() -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (1000, 3))
     points[:200] *= 100
     observable = np.arange(1000) >= 200

@@ -1,4 +1,4 @@
-"""Front-ends and mapper of the comparison, and what they take."""
+"""Front-ends and mapper of the comparison, and measurement of their time and memory."""
 
 import csv
 import os
@@ -30,10 +30,8 @@ from colmap_av1.options import CameraOptions, DensityOptions, MapOptions, MatchO
 EXAMPLES = PROJECT / "examples"
 
 
-# Run in processes of their own.
-
-
 def _work(megabytes, seconds):
+    """Use memory and CPU time, and return the process id."""
     block = np.ones(megabytes << 17)
     end = time.process_time() + seconds
     while time.process_time() < end:
@@ -46,8 +44,9 @@ def _fail(error):
     raise error
 
 
-def test_a_call_is_measured_in_its_own_process(tmp_path):
-    ballast = np.ones(300 << 17)  # must not count
+def test_call_is_measured_in_its_own_process(tmp_path):
+    """Memory of this process, 300 MiB here, must not count."""
+    ballast = np.ones(300 << 17)
     small = run_measured(_work, 1, 0.3, log=tmp_path / "log")
     large = run_measured(_work, 200, 0.3, log=tmp_path / "log")
     assert small.result != os.getpid()
@@ -59,7 +58,7 @@ def test_a_call_is_measured_in_its_own_process(tmp_path):
         assert large.peak_memory < ballast.nbytes + (200 << 20)
 
 
-def test_a_failing_call_says_where_its_log_is(tmp_path):
+def test_failing_call_raises_its_error_and_writes_a_log(tmp_path):
     log = tmp_path / "log"
     with pytest.raises(VideoError, match="no such video"):
         run_measured(_fail, VideoError("no such video"), log=log)
@@ -71,13 +70,14 @@ def test_a_failing_call_says_where_its_log_is(tmp_path):
 
 
 def _start(path):
+    """Start a process that sleeps, write its id to a file, and wait for it."""
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     path.write_text(str(child.pid))
     child.wait()
 
 
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
-def test_an_interrupt_ends_what_the_process_started(tmp_path):
+def test_interrupt_ends_the_children_of_the_process(tmp_path):
     path = tmp_path / "pid"
 
     def interrupt():
@@ -85,7 +85,7 @@ def test_an_interrupt_ends_what_the_process_started(tmp_path):
             time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGINT)
 
-    # What was started in the background of a shell ignores interrupts.
+    # Processes in the background of a shell ignore interrupts by default.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     thread = threading.Thread(target=interrupt)
     thread.start()
@@ -106,13 +106,13 @@ def _is_alive(pid):
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    # One that nobody waits for is a zombie.
+    # A process that has ended is a zombie until its parent waits for it.
     stat = Path(f"/proc/{pid}/stat")
     return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-def test_tracks_of_a_database_are_those_written(clip, tmp_path):
-    # Every pair of images is written, so nothing but verification takes tracks apart.
+def test_tracks_of_a_database_are_the_written_ones(clip, tmp_path):
+    # Only verification can split a track, because all pairs of images are written.
     options = MatchOptions(
         tracks=TrackOptions(min_length=3), density=DensityOptions(preset="dense")
     )
@@ -128,19 +128,18 @@ def test_tracks_of_a_database_are_those_written(clip, tmp_path):
     written = {(f, *xy) for f, xy in zip(tracks.frame, tracks.xy.tolist(), strict=True)}
     assert {(f, *xy) for f, xy in zip(found.frame, found.xy.tolist(), strict=True)} <= written
     assert found.num_observations > 0.7 * tracks.num_observations
-    of = {}
+    track_of = {}
     for t in range(tracks.num_tracks):
         for i in range(*tracks.offsets[t : t + 2]):
-            of[(tracks.frame[i], *tracks.xy[i].tolist())] = t
+            track_of[(tracks.frame[i], *tracks.xy[i].tolist())] = t
     for start, end in zip(found.offsets[:-1], found.offsets[1:], strict=True):
-        frames = found.frame[start:end]
-        assert (np.diff(frames) > 0).all()
-        assert len({of[(found.frame[i], *found.xy[i].tolist())] for i in range(start, end)}) == 1
+        assert (np.diff(found.frame[start:end]) > 0).all()
+        own = {track_of[(found.frame[i], *found.xy[i].tolist())] for i in range(start, end)}
+        assert len(own) == 1
 
 
-def test_contradicting_matches_are_left_out(tmp_path):
-    # Keypoint 0 of image 1 is matched to 0 of image 2, that to 0 of image 3 and to 1 of image 4,
-    # and that of 3 to 0 of image 4: of image 4 nothing is sure.
+def test_tracks_leave_out_contradicting_matches(tmp_path):
+    """The matches lead to both keypoints of image 4: to 0 from image 3 and to 1 from image 2."""
     path = tmp_path / "a.db"
     with pycolmap.Database.open(path) as database:
         camera = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 50, 32, 24])
@@ -165,7 +164,7 @@ def test_contradicting_matches_are_left_out(tmp_path):
 
 @pytest.fixture(scope="module")
 def scene_footage(ffmpeg, tmp_path_factory):
-    """Footage of the rendered clip at three quarters of its size."""
+    """Footage of the rendered clip at three quarters of the size."""
     folder = tmp_path_factory.mktemp("scene")
     words = ["-vf", "scale=480:270:flags=area", "-pix_fmt", "yuv420p", *AV1]
     video = tmp_path_factory.mktemp("smaller") / "smaller.mp4"
@@ -176,10 +175,10 @@ def scene_footage(ffmpeg, tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["av1-dense", "sift-sequential"])
-def test_frontends_fill_databases_that_map(name, scene_footage, tmp_path):
+def test_databases_of_frontends_can_be_mapped(name, scene_footage, tmp_path):
     run = measure_frontend(name, scene_footage, tmp_path / name)
     again = measure_frontend(name, scene_footage, tmp_path / name)
-    assert again == run  # to the last digit of its times: it was kept
+    assert again == run  # with the same times, because the first run is reused
     assert run.cpu_seconds > 0.1
     assert sum(run.seconds.values()) > 0.1
     with pycolmap.Database.open(run.database) as database:
@@ -193,9 +192,9 @@ def test_frontends_fill_databases_that_map(name, scene_footage, tmp_path):
     assert statistics.coverage[0] > 0.5
 
     settings = MapOptions(refine_intrinsics=False)
-    given = (run.database, scene_footage.image_path, tmp_path / "model", settings)
-    mapper = measure_mapper(*given)
-    assert measure_mapper(*given) == mapper
+    arguments = (run.database, scene_footage.image_path, tmp_path / "model", settings)
+    mapper = measure_mapper(*arguments)
+    assert measure_mapper(*arguments) == mapper
     figures = model_figures(mapper.model)
     assert figures.num_registered == 8
     assert figures.num_points > 1000
@@ -217,7 +216,7 @@ def test_frontends_fill_databases_that_map(name, scene_footage, tmp_path):
     assert model_figures(again).mean_error < 1
 
 
-def test_a_database_that_makes_no_model(clip, tmp_path):
+def test_mapper_reports_that_a_database_gives_no_model(clip, tmp_path):
     footage = prepare_footage(
         clip, tmp_path / "footage", num_frames=16, image_step=8, camera=CameraOptions()
     )

@@ -1,4 +1,4 @@
-"""Matches that agree with an estimate of all poses."""
+"""Matches that agree with a joint estimate of all poses."""
 
 from __future__ import annotations
 
@@ -43,14 +43,15 @@ OPTIONS = MatchOptions(images=ImageOptions(every=EVERY))
 
 
 def by_pairs(options: MatchOptions) -> MatchOptions:
+    """The same options with verification pair by pair."""
     return replace(options, verify=VerifyOptions(verify="pairs"))
 
 
 def mapped(database: Path, images: Path) -> pycolmap.Reconstruction:
-    """What COLMAP's incremental mapper writes to folder 0."""
+    """Run COLMAP's incremental mapper, and return the model in folder 0."""
     output = database.with_suffix(".models")
     output.mkdir()
-    # pycolmap brings a database to its own layout.
+    # pycolmap migrates the database that it opens.
     copy = shutil.copyfile(database, output / "copy.db")
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, num_threads=1)
     pycolmap.incremental_mapping(copy, images, output, options=options)
@@ -78,7 +79,7 @@ def joint(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> MatchReport:
     return match(folder / "a.db", scene, image_path=folder / "images", options=OPTIONS)
 
 
-def test_a_mapper_gets_fewer_keypoints_and_ends_nearer_to_the_truth(
+def test_mapper_gets_fewer_keypoints_and_better_poses_with_joint_matches(
     joint: MatchReport, scene: Path, truth: Truth, tmp_path: Path
 ) -> None:
     images = joint.image_path
@@ -99,7 +100,7 @@ def test_a_mapper_gets_fewer_keypoints_and_ends_nearer_to_the_truth(
     assert errors[0] < errors[1]
 
 
-def test_the_camera_is_that_of_the_estimate(joint: MatchReport, truth: Truth) -> None:
+def test_camera_of_the_database_is_the_estimated_one(joint: MatchReport, truth: Truth) -> None:
     assert joint.focal_length == pytest.approx(truth.camera.focal_length_x * SIZE, rel=0.005)
     (camera,) = read_cameras(joint.database).values()
     assert camera.has_prior_focal_length
@@ -114,20 +115,22 @@ def test_no_track_has_two_keypoints_in_an_image(joint: MatchReport) -> None:
             assert near[:, 1].min() > 0.01
 
 
-def test_pairs_that_are_asked_for(joint: MatchReport, scene: Path, tmp_path: Path) -> None:
+def test_given_pairs_exclude_a_joint_estimate(
+    joint: MatchReport, scene: Path, tmp_path: Path
+) -> None:
     """A joint estimate chooses the pairs itself."""
-    images, asked = joint.image_path, PairOptions(offsets=(1, 2), growth=1)
+    images, given = joint.image_path, PairOptions(offsets=(1, 2), growth=1)
     report = match(
-        tmp_path / "a.db", scene, image_path=images, options=replace(OPTIONS, pairs=asked)
+        tmp_path / "a.db", scene, image_path=images, options=replace(OPTIONS, pairs=given)
     )
     assert report.estimate is None
     assert report.num_pairs == 2 * joint.num_images - 3
-    options = replace(OPTIONS, pairs=asked, verify=VerifyOptions(verify="joint"))
+    options = replace(OPTIONS, pairs=given, verify=VerifyOptions(verify="joint"))
     with pytest.raises(OptionError, match="offsets"):
         match(tmp_path / "b.db", scene, image_path=images, options=options)
 
 
-def test_a_failed_estimate_that_is_asked_for(scene: Path, tmp_path: Path) -> None:
+def test_requested_joint_estimate_that_fails_is_an_error(scene: Path, tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_text("0\n4\n")
     options = MatchOptions(
         images=ImageOptions(frame_list=str(tmp_path / "list.txt")),
@@ -139,7 +142,10 @@ def test_a_failed_estimate_that_is_asked_for(scene: Path, tmp_path: Path) -> Non
     assert not (tmp_path / "a.db").exists()
 
 
-def test_the_same_database_again(joint: MatchReport, scene: Path, tmp_path: Path) -> None:
+def test_same_input_gives_the_same_database(
+    joint: MatchReport, scene: Path, tmp_path: Path
+) -> None:
+    """The number of threads makes no difference."""
     one = replace(OPTIONS, run=RunOptions(num_threads=1))
     match(tmp_path / "a.db", scene, image_path=joint.image_path, options=one)
     dumps = []
@@ -149,7 +155,7 @@ def test_the_same_database_again(joint: MatchReport, scene: Path, tmp_path: Path
     assert dumps[0] == dumps[1]
 
 
-def test_images_of_half_the_size(
+def test_focal_length_fits_existing_images_of_half_the_size(
     joint: MatchReport, scene: Path, truth: Truth, tmp_path: Path
 ) -> None:
     assert joint.image_path is not None
@@ -164,7 +170,9 @@ def test_images_of_half_the_size(
     assert report.focal_length == pytest.approx(truth.camera.focal_length_x * SIZE / 2, rel=0.01)
 
 
-def test_too_few_images_for_an_estimate(scene: Path, tmp_path: Path) -> None:
+def test_too_few_images_for_a_joint_estimate_are_verified_by_pairs(
+    scene: Path, tmp_path: Path
+) -> None:
     (tmp_path / "list.txt").write_text("0\n4\n")
     options = MatchOptions(
         images=ImageOptions(frame_list=str(tmp_path / "list.txt")),
@@ -177,14 +185,16 @@ def test_too_few_images_for_an_estimate(scene: Path, tmp_path: Path) -> None:
     assert num_keypoints(tmp_path / "a.db") == num_keypoints(tmp_path / "b.db")
 
 
-def test_a_camera_for_each_image(joint: MatchReport, scene: Path, tmp_path: Path) -> None:
+def test_camera_per_image_excludes_a_joint_estimate(
+    joint: MatchReport, scene: Path, tmp_path: Path
+) -> None:
     assert joint.image_path is not None
     few = tmp_path / "few"
     few.mkdir()
     for path in sorted(joint.image_path.iterdir())[:4]:
         shutil.copy(path, few)
-    database = tmp_path / "listed.db"
-    with pycolmap.Database.open(database):  # makes the file
+    database = tmp_path / "existing.db"
+    with pycolmap.Database.open(database):  # creates the file
         pass
     pycolmap.import_images(database, few, pycolmap.CameraMode.PER_IMAGE)
     report = match(database, scene, image_path=few)
@@ -196,14 +206,17 @@ def test_a_camera_for_each_image(joint: MatchReport, scene: Path, tmp_path: Path
         match(tmp_path / "new.db", scene, image_path=joint.image_path, options=options)
 
 
-def test_nothing_is_left_beside_the_database(joint: MatchReport) -> None:
+def test_no_temporary_files_are_left_next_to_the_database(joint: MatchReport) -> None:
     assert {path.name for path in joint.database.parent.iterdir()} >= {"a.db", "images"}
     assert not [p for p in joint.database.parent.iterdir() if p.name.startswith(".")]
 
 
 @pytest.mark.parametrize("count", [13, 8])
-def test_two_scenes(count: int, encode: Encode, tmp_path: Path) -> None:
-    """An estimate has a model of each scene, the larger first; one of few images has none."""
+def test_estimate_has_a_model_of_each_scene(count: int, encode: Encode, tmp_path: Path) -> None:
+    """The larger model comes first, and a scene with too few images has none.
+
+    The second scene is the mirrored end of the clip, in which nothing matches the first.
+    """
     pictures = [smaller(picture, 0.75) for _, picture in decode_frames(SCENE)]
     videos = [
         encode(
@@ -222,9 +235,9 @@ def test_two_scenes(count: int, encode: Encode, tmp_path: Path) -> None:
     first, *others = report.estimate.num_registered
     assert first >= 16
     assert [number >= 11 for number in others] == [True] * (count >= 10)
-    left = report.num_images - first - sum(others)
-    warned = any(f"{left} of {report.num_images} images" in w for w in report.warnings)
-    assert warned == (left > 0)
+    num_missing = report.num_images - first - sum(others)
+    is_reported = any(f"{num_missing} of {report.num_images} images" in w for w in report.warnings)
+    assert is_reported == (num_missing > 0)
     assert min(num_keypoints(report.database).values()) > 100
     if count >= 10:
         models = tmp_path / "models"
@@ -237,12 +250,13 @@ def test_two_scenes(count: int, encode: Encode, tmp_path: Path) -> None:
 
 
 def images_ahead(count: int) -> list[ModelImage]:
-    """A camera that moves along its axis."""
+    """Images of a camera that moves along its axis."""
     poses = [np.hstack([np.eye(3), [[0], [0], [-1.0 * i]]]) for i in range(count)]
     return [ModelImage(i + 1, f"{i}.png", 1, pose) for i, pose in enumerate(poses)]
 
 
-def test_a_drive_begins_by_what_lies_beside_the_road() -> None:
+def test_starting_pair_of_a_drive_uses_points_beside_the_road() -> None:
+    """Distant points ahead have too little parallax."""
     rng = np.random.default_rng(0)
     images = images_ahead(12)
     far = np.column_stack([rng.uniform(-20, 20, (2000, 2)), rng.uniform(100, 200, 2000)])
