@@ -1,4 +1,4 @@
-"""A rendered fisheye clip through every stage, with exact poses."""
+"""All stages with a rendered fisheye clip whose poses are known exactly."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ OPTIONS = ReconstructOptions(
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip of a lens that sees 118 degrees across, and its exact poses."""
+    """A clip of a lens with a field of view of 118 degrees, and the exact poses."""
 
     video: Path
     cam_from_world: np.ndarray
@@ -75,7 +75,10 @@ def clip(encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Clip:
 
 
 def error(model: Path, clip: Clip) -> float:
-    """RMS distance of the camera centres in metres, of a path of 1.9 m; all frames have a pose."""
+    """RMS error of the camera centres in metres, on a path of 1.9 m.
+
+    Fails if a frame is not registered.
+    """
     images = posed_images(read_model(model))
     assert len(images) == NUM_FRAMES
     frames = [int(name[6:12]) for name in images]
@@ -88,8 +91,7 @@ def made(clip: Clip, tmp_path_factory: pytest.TempPathFactory) -> ReconstructRep
     return reconstruct(clip.video, tmp_path_factory.mktemp("made") / "out", options=OPTIONS)
 
 
-def test_intrinsics_are_found(clip: Clip, made: ReconstructReport) -> None:
-    """And the model is undistorted for trainers."""
+def test_undistorted_model_is_accurate(clip: Clip, made: ReconstructReport) -> None:
     model = read_model(made.output / "sparse" / "0")
     assert [camera.model_name for camera in model.cameras.values()] == ["PINHOLE"]
     assert error(made.output / "sparse" / "0", clip) < 0.01
@@ -100,14 +102,16 @@ def test_intrinsics_are_found(clip: Clip, made: ReconstructReport) -> None:
 def original(
     clip: Clip, made: ReconstructReport, tmp_path_factory: pytest.TempPathFactory
 ) -> ReconstructReport:
-    """The same with the pictures as they are."""
+    """The same reconstruction without undistortion, resumed after the adjustment."""
     output = tmp_path_factory.mktemp("original") / "out"
     shutil.copytree(made.output, output)
     return reconstruct(clip.video, output, options=replace(OPTIONS, undistort=False))
 
 
-def test_pictures_stay_as_they_are(clip: Clip, original: ReconstructReport) -> None:
-    """Only what writes the model is redone."""
+def test_without_undistortion_pictures_are_those_of_the_video(
+    clip: Clip, original: ReconstructReport
+) -> None:
+    """Only the stage that writes the model runs again."""
     assert not {"tracks", "matches", "poses", "adjustment"} - {*original.resumed}
     assert "model" not in original.resumed
     for frame, picture in decode_frames(clip.video):
@@ -115,53 +119,54 @@ def test_pictures_stay_as_they_are(clip: Clip, original: ReconstructReport) -> N
         np.testing.assert_array_equal(written, picture)
 
 
-def test_points_project_with_the_distortion(
+def test_points_project_with_the_distortion_model(
     clip: Clip, made: ReconstructReport, original: ReconstructReport
 ) -> None:
-    """Those that the undistorted pictures do not show, too."""
+    """This includes points outside the undistorted pictures."""
     (pinhole,) = read_model(made.output / "sparse" / "0").cameras.values()
     model = read_model(original.output / "sparse" / "0")
     (camera,) = model.cameras.values()
     assert camera.model_name == MODEL
     assert original.focal_lengths[0] == pytest.approx(FOCAL, rel=0.02)
     assert error(original.output / "sparse" / "0", clip) < 0.01
-    num_cut = 0
+    num_outside = 0
     for point in model.points3D.values():
         errors = []
-        for seen in point.track.elements:
-            image = model.images[seen.image_id]
-            xy = image.points2D[seen.point2D_idx].xy
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            xy = image.points2D[element.point2D_idx].xy
             in_camera = image.cam_from_world() * point.xyz
             errors.append(np.linalg.norm(camera.img_from_cam(in_camera) - xy))
-            at = pinhole.img_from_cam(in_camera)
-            num_cut += not (0 <= at[0] < WIDTH and 0 <= at[1] < HEIGHT)
+            x, y = pinhole.img_from_cam(in_camera)
+            num_outside += not (0 <= x < WIDTH and 0 <= y < HEIGHT)
         assert np.mean(errors) == pytest.approx(point.error, abs=1e-6)
         assert np.mean(errors) <= OPTIONS.triangulate.max_reprojection_error
-    assert num_cut > 0.05 * original.num_observations
+    assert num_outside > 0.05 * original.num_observations
 
 
 @pytest.mark.parametrize("trainer", RENDERED)
-def test_trainers_render_the_distortion(trainer: Trainer, original: ReconstructReport) -> None:
-    taken = trainer(original.output)
-    (camera,) = read_model(taken.model).cameras.values()
+def test_trainers_read_the_distorted_model(trainer: Trainer, original: ReconstructReport) -> None:
+    data = trainer(original.output)
+    (camera,) = read_model(data.model).cameras.values()
     assert camera.model_name in RENDERED[trainer]
-    assert all(picture.is_file() for picture in taken.pictures.values())
+    assert all(picture.is_file() for picture in data.pictures.values())
 
 
-def test_marks_of_a_scale_are_in_the_original_pictures(
+def test_marks_of_a_scale_are_positions_in_the_original_pictures(
     clip: Clip, original: ReconstructReport, tmp_path: Path
 ) -> None:
-    """The distance of two points, each marked in the first and the last image that sees it."""
+    """Two points have a given distance, and each is marked in its first and last image."""
     model = read_model(original.output / "sparse" / "0")
     by_length = sorted(model.points3D.values(), key=lambda point: -point.track.length())[:50]
     one = by_length[0]
     two = max(by_length, key=lambda point: float(np.linalg.norm(point.xyz - one.xyz)))
 
     def mark(point: pycolmap.Point3D) -> str:
-        seen = {model.images[e.image_id].name: e for e in point.track.elements}
+        elements = {model.images[e.image_id].name: e for e in point.track.elements}
         marks = []
-        for name in (min(seen), max(seen)):
-            x, y = model.images[seen[name].image_id].points2D[seen[name].point2D_idx].xy
+        for name in (min(elements), max(elements)):
+            element = elements[name]
+            x, y = model.images[element.image_id].points2D[element.point2D_idx].xy
             marks.append(f"{name}:{x:.3f}:{y:.3f}")
         return "+".join(marks)
 
@@ -170,12 +175,11 @@ def test_marks_of_a_scale_are_in_the_original_pictures(
     place = PlaceOptions(align="none", scale=f"2={mark(one)},{mark(two)}")
     options = replace(OPTIONS, undistort=False, place=place)
     placed = reconstruct(clip.video, output, options=options)
-    apart = float(np.linalg.norm(one.xyz - two.xyz))
-    assert apart * placed.place.scale == pytest.approx(2, rel=0.05)
+    distance = float(np.linalg.norm(one.xyz - two.xyz))
+    assert distance * placed.place.scale == pytest.approx(2, rel=0.05)
 
 
-def test_camera_stays_what_it_is(clip: Clip, tmp_path: Path) -> None:
-    """In the database, the mapper's model, and that with dense points."""
+def test_camera_model_is_kept_by_match_map_and_densify(clip: Clip, tmp_path: Path) -> None:
     database, images = tmp_path / "a.db", tmp_path / "images"
     matched = match(database, clip.video, image_path=images, options=MATCHING)
     assert matched.focal_length == pytest.approx(FOCAL, rel=0.05)

@@ -1,3 +1,5 @@
+"""SIFT links: matches of SIFT features across gaps, where motion connects images badly."""
+
 from __future__ import annotations
 
 import copy
@@ -40,10 +42,10 @@ from colmap_av1.video.decoding import decode_frames
 
 SCENE = PROJECT / "examples" / "scene.mp4"
 TRUTH = PROJECT / "examples" / "scene_truth.npz"
-# Frames left out of the rendered clip, so that it jerks there.
+# Frames removed from the rendered clip, so that the camera jerks there.
 LEFT_OUT = range(24, 40)
 FAR_OUT = range(14, 46)
-# With these left out, a tenth of the usual number of points join the images at the jerk.
+# Without these frames, a tenth of the usual number of points join the images at the jerk.
 DOUBTFUL_OUT = range(8, 50)
 
 
@@ -62,7 +64,7 @@ def halved() -> NDArray[np.uint8]:
 def steady(
     halved: NDArray[np.uint8], encode: Encode, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """A part of the rendered clip."""
+    """The rendered clip up to frame 35."""
     return encode(halved[:36], tmp_path_factory.mktemp("steady") / "steady.mp4", *QUICK_AV1)
 
 
@@ -70,7 +72,7 @@ def steady(
 def jerk(
     halved: NDArray[np.uint8], encode: Encode, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """The rendered clip without some frames in its middle."""
+    """The rendered clip without 16 frames in the middle."""
     return encode(_without(halved, LEFT_OUT), tmp_path_factory.mktemp("jerk") / "jerk.mp4")
 
 
@@ -78,7 +80,7 @@ def jerk(
 def far_jerk(
     halved: NDArray[np.uint8], encode: Encode, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """The rendered clip without a longer part of its middle."""
+    """The rendered clip without 32 frames in the middle."""
     return encode(_without(halved, FAR_OUT), tmp_path_factory.mktemp("far") / "jerk.mp4")
 
 
@@ -86,7 +88,7 @@ def _without(frames: NDArray[np.uint8], left_out: range) -> NDArray[np.uint8]:
     return np.delete(frames, left_out, axis=0)
 
 
-def test_features_agree_with_the_truth() -> None:
+def test_feature_matches_agree_with_the_true_epipolar_lines() -> None:
     images = pictures()
     a, b = extract_features(images[0], 1500), extract_features(images[30], 1500)
     matches = match_features(a, b)
@@ -107,29 +109,41 @@ def test_features_agree_with_the_truth() -> None:
     assert np.median(distance) < 0.5
 
 
-def test_no_features_match_nothing() -> None:
+def test_image_without_features_has_no_matches() -> None:
     plain = extract_features(np.full((64, 64, 3), 128, np.uint8), 100)
     assert plain.xy.shape == (0, 2)
     assert len(match_features(plain, extract_features(pictures()[0], 100))) == 0
 
 
-def test_similar_images_see_the_same() -> None:
+@pytest.fixture(scope="module")
+def there_and_back() -> list[Features]:
+    """Features of images along a path, and the same in reverse order."""
     there = [extract_features(image, 800) for image in pictures()[::6]]
-    back = [copy.deepcopy(f) for f in reversed(there)]
-    features = [*there, *back]
-    count = len(features)
-    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) >= 3
-    pairs = similar_images(features, apart, 1)
-    assert np.array_equal(pairs, similar_images(features, apart, 1))
+    return [*there, *(copy.deepcopy(f) for f in reversed(there))]
+
+
+def are_apart(count: int) -> NDArray[np.bool_]:
+    """Whether images are at least 3 images apart, [count, count]."""
+    return np.abs(np.subtract.outer(np.arange(count), np.arange(count))) >= 3
+
+
+def test_similar_images_show_the_same_place(there_and_back: list[Features]) -> None:
+    count = len(there_and_back)
+    pairs = similar_images(there_and_back, are_apart(count), 1)
+    assert np.array_equal(pairs, similar_images(there_and_back, are_apart(count), 1))
     found = {tuple(pair) for pair in pairs.tolist()}
-    # Each place is seen again on the way back.
     assert all((i, count - 1 - i) in found for i in range(count // 2 - 2))
 
 
-def test_images_without_features_are_like_none() -> None:
+def test_images_without_features_are_less_similar_than_the_same_place(
+    there_and_back: list[Features],
+) -> None:
     plain = extract_features(np.full((64, 64, 3), 128, np.uint8), 100)
-    allowed = ~np.eye(3, dtype=bool)
-    assert len(similar_images([plain] * 3, allowed, 1)) <= 3
+    count = len(there_and_back)
+    pairs = similar_images([*there_and_back, plain, plain], are_apart(count + 2), 1)
+    found = {tuple(pair) for pair in pairs.tolist()}
+    assert all((i, count - 1 - i) in found for i in range(count // 2 - 2))
+    assert len(similar_images([plain] * 4, are_apart(4), 1)) == 1
 
 
 @given(
@@ -138,11 +152,13 @@ def test_images_without_features_are_like_none() -> None:
         max_size=30,
     )
 )
-def test_tracks_of_links_see_no_frame_twice(edges: list[tuple[int, int, int, int]]) -> None:
+def test_tracks_of_links_have_one_observation_per_frame(
+    edges: list[tuple[int, int, int, int]],
+) -> None:
     rng = np.random.default_rng(0)
-    nothing = np.zeros((5, 128), np.float32)
+    descriptors = np.zeros((5, 128), np.float32)
     features = {
-        i: Features(rng.uniform(0, 100, (5, 2)).astype(np.float32), nothing) for i in range(4)
+        i: Features(rng.uniform(0, 100, (5, 2)).astype(np.float32), descriptors) for i in range(4)
     }
     by_pair: dict[tuple[int, int], set[tuple[int, int]]] = {}
     for i, j, a, b in edges:
@@ -155,9 +171,9 @@ def test_tracks_of_links_see_no_frame_twice(edges: list[tuple[int, int, int, int
     frames = np.array([0, 10, 20, 30], np.int32)
     tracks = links_as_tracks(links, features, frames, 40, (100, 100))
     for start, stop in zip(tracks.offsets[:-1], tracks.offsets[1:], strict=True):
-        seen = tracks.frame[start:stop]
-        assert len(seen) >= 2
-        assert np.all(np.diff(seen) > 0)
+        own = tracks.frame[start:stop]
+        assert len(own) >= 2
+        assert np.all(np.diff(own) > 0)
     assert len(tracks.xy) == tracks.offsets[-1]
 
 
@@ -166,7 +182,9 @@ def linked(jerk: Path, tmp_path_factory: pytest.TempPathFactory) -> MatchReport:
     return match(tmp_path_factory.mktemp("linked") / "a.db", jerk)
 
 
-def test_jerk_is_linked(jerk: Path, linked: MatchReport, tmp_path: Path) -> None:
+def test_gap_at_a_jerk_is_linked_and_reported(
+    jerk: Path, linked: MatchReport, tmp_path: Path
+) -> None:
     report = linked
     before = LEFT_OUT.start - 1
     assert report.links.frames_of_gaps() == [(before, before + 1)]
@@ -178,17 +196,17 @@ def test_jerk_is_linked(jerk: Path, linked: MatchReport, tmp_path: Path) -> None
     assert before - 2 < int(named[1]) <= before < int(named[2]) < before + 3
     findings = check_database(linked.database).findings
     assert ("warning", warning) in [(f.severity, f.text) for f in findings]
-    alone = match(tmp_path / "b.db", jerk, options=MatchOptions(links=LinkOptions(links="none")))
-    assert alone.links.num_images == 0
-    assert report.num_pairs > alone.num_pairs
+    unlinked = match(tmp_path / "b.db", jerk, options=MatchOptions(links=LinkOptions(links="none")))
+    assert unlinked.links.num_images == 0
+    assert report.num_pairs > unlinked.num_pairs
 
 
-def test_links_are_the_same_each_time(jerk: Path, linked: MatchReport, tmp_path: Path) -> None:
+def test_same_input_gives_the_same_links(jerk: Path, linked: MatchReport, tmp_path: Path) -> None:
     match(tmp_path / "b.db", jerk)
     assert linked.database.read_bytes() == (tmp_path / "b.db").read_bytes()
 
 
-def test_nothing_is_decoded_where_motion_connects_all(
+def test_no_picture_is_decoded_if_motion_connects_all_images(
     steady: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object, **__: object) -> Iterator[None]:
@@ -200,10 +218,10 @@ def test_nothing_is_decoded_where_motion_connects_all(
 
 
 @pytest.mark.shared
-def test_drive_whose_motion_is_rigid_needs_no_pictures(
+def test_no_picture_of_a_drive_with_rigid_motion_is_compared(
     shared: Path, encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Half of its units are intra coded, yet nearly all of its motion is that of a rigid scene."""
+    """Half of the units are intra coded, but nearly all motion vectors fit a rigid scene."""
     frames = sorted((shared / "sequences" / "street" / "frames").iterdir())[:9]
     drive = encode(np.array([cv2.imread(str(f)) for f in frames]), tmp_path / "drive.mp4")
     street = CameraOptions("PINHOLE", "707.0912,707.0912,602.3873,183.6104")
@@ -214,15 +232,15 @@ def test_drive_whose_motion_is_rigid_needs_no_pictures(
     assert (tmp_path / "a.db").read_bytes() == (tmp_path / "b.db").read_bytes()
 
 
-def test_gaps_that_only_seem_weak_need_few_pictures(
+def test_suspected_gap_that_pictures_refute_gets_no_links(
     steady: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def seeming(
+    def suspected(
         _: object, frames: NDArray[np.int32], *, certain: bool = False
     ) -> NDArray[np.bool_]:
         return (np.arange(len(frames) - 1) == 20) & (not certain)
 
-    monkeypatch.setattr("colmap_av1.matching.gaps.low_inter_gaps", seeming)
+    monkeypatch.setattr("colmap_av1.matching.gaps.low_inter_gaps", suspected)
     report = match(tmp_path / "a.db", steady)
     assert report.links.num_images == 4
     assert report.links.gaps == ()
@@ -231,10 +249,10 @@ def test_gaps_that_only_seem_weak_need_few_pictures(
     assert (tmp_path / "a.db").read_bytes() == (tmp_path / "b.db").read_bytes()
 
 
-def test_jerk_that_seems_ordinary_is_linked(
+def test_gap_that_pictures_contradict_is_linked(
     far_jerk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where the share of inter units tells little, few pictures contradict the motion."""
+    """The share of inter units does not reveal this gap, because its bounds are lowered."""
     monkeypatch.setattr("colmap_av1.matching.gaps._LEAST_INTER_SHARE", 0.001)
     monkeypatch.setattr("colmap_av1.matching.gaps._CERTAINLY_LESS", 0.0)
     report = match(tmp_path / "a.db", far_jerk)
@@ -245,7 +263,7 @@ def test_jerk_that_seems_ordinary_is_linked(
 
 
 @pytest.mark.slow
-def test_jerk_bends_no_model(jerk: Path, tmp_path: Path) -> None:
+def test_model_of_a_clip_with_a_jerk_has_correct_poses(jerk: Path, tmp_path: Path) -> None:
     made = reconstruct(jerk, tmp_path / "out", options=ReconstructOptions())
     assert made.far_views is not None
     assert made.far_views < 0.6
@@ -253,10 +271,10 @@ def test_jerk_bends_no_model(jerk: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_jerk_that_only_the_model_shows(
+def test_gap_that_only_the_model_reveals_is_linked(
     halved: NDArray[np.uint8], encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where few points join the images at a jerk, pictures are matched there and all is mapped."""
+    """Few points join the images at the jerk, so the pictures there are matched as well."""
     monkeypatch.setattr("colmap_av1.matching.gaps._LEAST_INTER_SHARE", 0.001)
     monkeypatch.setattr("colmap_av1.matching.gaps._LEAST_OF_NEIGHBOURS", 0.0)
     monkeypatch.setattr("colmap_av1.matching.gaps._CERTAINLY_LESS", 0.0)
@@ -270,7 +288,7 @@ def test_jerk_that_only_the_model_shows(
     assert set(again.resumed) >= {"tracks", "matches", "poses", "adjustment", "model"}
     assert again.links == made.links
 
-    # Without links corners that are found again across it hold the model together.
+    # Without links, corners that are matched across the gap hold the model together.
     without = ReconstructOptions(match=MatchOptions(links=LinkOptions(links="none")))
     held = reconstruct(video, tmp_path / "held", options=without)
     assert held.warnings == ()
@@ -278,7 +296,7 @@ def test_jerk_that_only_the_model_shows(
 
 
 def _check_poses(made: ReconstructReport, left_out: range, bound: float) -> None:
-    """All images are where the truth has them, to a share of its extent."""
+    """Check that all images are registered, with position errors below a share of the path."""
     kept = [i for i in range(60) if i not in left_out]
     assert made.num_registered == len(kept)
     poses = model_poses(pycolmap.Reconstruction(str(made.output / "sparse" / "0")), len(kept))
@@ -289,8 +307,10 @@ def _check_poses(made: ReconstructReport, left_out: range, bound: float) -> None
     assert alignment_error(found, centres) < bound * extent
 
 
-def test_what_nothing_connects_is_said(encode: Encode, tmp_path: Path) -> None:
-    """A cut from one place to another that shows nothing of the first."""
+def test_gap_without_overlap_is_reported_and_gets_no_matches(
+    encode: Encode, tmp_path: Path
+) -> None:
+    """The video has a cut to another place."""
     first = np.array([image[:128, :192] for image in pictures()[:14]])
     video = encode(np.concatenate([first, make_frames(14)]), tmp_path / "cut.mp4")
     report = match(tmp_path / "a.db", video)
@@ -308,10 +328,10 @@ def test_what_nothing_connects_is_said(encode: Encode, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("links", ["auto", "sift"])
-def test_frames_of_one_colour(
+def test_frames_of_one_colour_are_refused(
     encode: Encode, tmp_path: Path, links: Literal["auto", "sift"]
 ) -> None:
-    """Links are looked for and there is nothing to see."""
+    """There are no tracks and no SIFT features."""
     grey = np.full((12, 128, 192, 3), 90, np.uint8)
     with pytest.raises(VideoError, match="detail"):
         match(
