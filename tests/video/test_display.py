@@ -304,7 +304,7 @@ def test_non_square_pixels_get_a_camera_with_two_focal_lengths(
     written = cv2.imread(str(tmp_path / "images" / "frame_000000.png"))
     assert written.shape == first.shape
 
-    options = MatchOptions(camera=CameraOptions("SIMPLE_RADIAL"))
+    options = MatchOptions(camera=CameraOptions("SIMPLE_RADIAL"), verify=PAIRS)
     (warning,) = match(tmp_path / "b.db", turned, options=options).warnings
     assert "SIMPLE_RADIAL" in warning
 
@@ -348,7 +348,8 @@ def test_superres_tracks_are_in_pixels_of_the_upscaled_picture(
     steps = np.diff(tracks.xy, axis=0)[is_next]
     assert np.median(steps[:, 0]) == pytest.approx(-6, abs=0.3)
     assert tracks.xy[:, 0].max() > 200
-    match(tmp_path / "a.db", clip, image_path=tmp_path / "images")
+    by_pairs = MatchOptions(verify=PAIRS)
+    match(tmp_path / "a.db", clip, image_path=tmp_path / "images", options=by_pairs)
     (first,) = images_of_ffmpeg(ffmpeg, clip, tmp_path / "cut", "-frames:v", "1")
     written = cv2.imread(str(tmp_path / "images" / "frame_000000.png"))
     assert written.shape == first.shape == (128, 256, 3)
