@@ -150,15 +150,15 @@ def test_bad_databases_and_folders_are_reported(
     output = tmp_path / "model"
     with pytest.raises(DatabaseError, match="no such file"):
         map_database(tmp_path / "missing.db", images, output)
-    (tmp_path / "empty.db").write_bytes(b"")
+    (tmp_path / "zero.db").write_bytes(b"")
     with pytest.raises(DatabaseError, match="empty"):
-        map_database(tmp_path / "empty.db", images, output)
+        map_database(tmp_path / "zero.db", images, output)
     unmatched = tmp_path / "unmatched.db"
     shutil.copyfile(database, unmatched)
     with sqlite3.connect(unmatched) as connection:
         connection.execute("DELETE FROM two_view_geometries")
     connection.close()
-    with pytest.raises(DatabaseError, match="15"):
+    with pytest.raises(DatabaseError, match="no pair"):
         map_database(unmatched, images, output)
     with pytest.raises(ImageError, match="no such folder"):
         map_database(database, tmp_path / "missing", output)

@@ -379,7 +379,7 @@ def test_special_files_are_refused_and_links_are_followed(tmp_path: Path) -> Non
     assert len(read_images(tmp_path / "new.db")) == len(NAMES)
 
 
-def test_missing_folder_is_reported(tmp_path: Path) -> None:
+def test_new_database_needs_an_existing_folder(tmp_path: Path) -> None:
     with pytest.raises(DatabaseError, match="folder"):
         write_matches(tmp_path / "no" / "new.db", NAMES, CAMERA, **ROWS)
 
@@ -391,7 +391,7 @@ def test_new_database_is_refused_next_to_an_old_log(tmp_path: Path) -> None:
         write_matches(tmp_path / "new.db", NAMES, CAMERA, **ROWS)
 
 
-def test_matches_without_keypoints_are_not_overwritten(tmp_path: Path) -> None:
+def test_database_without_keypoints_but_with_matches_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
     write_matches(path, NAMES, CAMERA, **ROWS)
     alter(path, "DELETE FROM keypoints")
@@ -465,7 +465,8 @@ def test_killed_write_leaves_the_old_content(tmp_path: Path, journal: str) -> No
 
 
 @pytest.mark.parametrize("existing", [False, True])
-def test_full_disk_leaves_the_file_unchanged(tmp_path: Path, existing: bool) -> None:
+def test_failed_write_leaves_the_file_unchanged(tmp_path: Path, existing: bool) -> None:
+    """The disk is full."""
     path = tmp_path / "given.db"
     if existing:
         write_images_only(path)

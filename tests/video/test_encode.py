@@ -284,15 +284,15 @@ def test_temporary_stream_is_removed(phone: Path, tmp_path: Path) -> None:
     (tmp_path / "videos").mkdir()
     video = Path(shutil.copy(phone, tmp_path / "videos" / "phone.mp4"))
     (tmp_path / "work").mkdir()
-    seen: set[str] = set()
+    found: set[str] = set()
 
     def list_files(stage: str, done: int, total: int | None) -> None:
-        seen.update(p.name for p in (tmp_path / "work").iterdir() if stage == "motion")
+        found.update(p.name for p in (tmp_path / "work").iterdir() if stage == "motion")
 
     report = match(tmp_path / "work" / "a.db", video, progress=list_files)
     assert report.streams == (None,)
     assert report.num_images == 12
-    assert len(seen) == 1
+    assert len(found) == 1
     assert [p.name for p in (tmp_path / "work").iterdir()] == ["a.db"]
     assert list(video.parent.iterdir()) == [video]
 
@@ -346,7 +346,7 @@ def test_damaged_video_is_used_up_to_the_damage(
     assert again.reused
     assert again.num_frames == 13
     bytes_before = first.output.read_bytes()
-    with pytest.raises(BitstreamError, match="13"):
+    with pytest.raises(BitstreamError, match="13 frames"):
         stream_of(video, first.output, strict=True)
     words = ["encode", "--video", str(video), "--output", str(tmp_path / "out.mp4"), "--quiet"]
     assert main([*words, "--strict"]) == 2
@@ -363,7 +363,7 @@ def test_frames_are_counted_if_the_container_does_not_store_their_number(
 ) -> None:
     video = ffmpeg("-i", phone, "-c", "copy", tmp_path / "phone.ts")
     done: list[tuple[str, int, int | None]] = []
-    encode_video(video, tmp_path / "out.mp4", progress=lambda *what: done.append(what))
+    encode_video(video, tmp_path / "out.mp4", progress=lambda *step: done.append(step))
     assert done[0] == ("encoding", 0, 12)
     assert done[-1] == ("encoding", 12, 12)
 
@@ -574,7 +574,7 @@ def test_encoder_that_fails_half_way_is_reported_with_its_frame_count(
     assert [p.name for p in tmp_path.iterdir()] == ["bin"]
 
 
-def test_full_disk_is_reported(
+def test_lack_of_space_is_reported(
     phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = """Svt[info]: ----
@@ -586,7 +586,7 @@ def test_full_disk_is_reported(
     assert [p.name for p in tmp_path.iterdir()] == ["ffmpeg"]
 
 
-def test_missing_encoder_is_reported(
+def test_ffmpeg_without_av1_is_reported(
     phone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program = fake_ffmpeg(tmp_path, "echo 'Unknown encoder' >&2; exit 1")
