@@ -36,6 +36,7 @@ from colmap_av1.options import (
     LinkOptions,
     MatchOptions,
     ReconstructOptions,
+    VerifyOptions,
 )
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.decoding import decode_frames
@@ -255,7 +256,8 @@ def test_gap_that_pictures_contradict_is_linked(
     """The share of inter units does not reveal this gap, because its bounds are lowered."""
     monkeypatch.setattr("colmap_av1.matching.gaps._LEAST_INTER_SHARE", 0.001)
     monkeypatch.setattr("colmap_av1.matching.gaps._CERTAINLY_LESS", 0.0)
-    report = match(tmp_path / "a.db", far_jerk)
+    by_pairs = MatchOptions(verify=VerifyOptions(verify="pairs"))
+    report = match(tmp_path / "a.db", far_jerk, options=by_pairs)
     before = FAR_OUT.start - 1
     assert report.links.frames_of_gaps() == [(before, before + 1)]
     assert report.links.num_images > 4
