@@ -54,6 +54,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         pytest.skip("needs the test data in ../shared")
 
 
+@pytest.fixture
+def tmp_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for a test, whose path does not contain the test's name.
+
+    Otherwise a message that contains a path in it would match words of the name.
+    """
+    return tmp_path_factory.mktemp("test")
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of test data next to the checkout."""

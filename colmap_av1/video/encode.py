@@ -46,10 +46,10 @@ from colmap_av1.video.stored_frames import count_frames
 from colmap_av1.video.unchanged import unchanged
 
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".webm": "webm", ".ivf": "ivf"}
+# Number of bytes at the start, in the middle and at the end of a video that identify it.
+_SAMPLE = 1 << 16
 # Begins the comment tag that records the source and settings of a stream, by which a kept stream
 # is recognized.
-# Bytes at the start, in the middle and at the end of a video that identify it.
-_SAMPLE = 1 << 16
 _MARK = "colmap-av1"
 # Containers that store the tag.
 _KEPT_FORMATS = (".mp4", ".mkv", ".webm")

@@ -70,5 +70,5 @@ def test_files_other_than_models_are_refused(
 
 def test_model_without_poses_is_refused(tmp_path: Path) -> None:
     pycolmap.Reconstruction().write_text(tmp_path)
-    with pytest.raises(ModelError, match="pose"):
+    with pytest.raises(ModelError, match="registered"):
         read_model(tmp_path)
