@@ -79,17 +79,17 @@ class _Limits:
         return bool(angle >= margin * self.min_angle) and (is_aside or self.max_forward_motion >= 1)
 
 
-def _limits(matched: MatchedImages) -> tuple[_Limits, ...]:
+def _limits(min_angle: float, max_forward_motion: float) -> tuple[_Limits, ...]:
     """The mapper's limits; the next ones are tried if no pair meets the first ones."""
-    first = _Limits(INITIAL_MIN_INLIERS, INITIAL_MIN_ANGLE, INITIAL_MAX_FORWARD_MOTION)
-    if matched.forward_motion:
-        first = _Limits(
-            INITIAL_MIN_INLIERS,
-            FORWARD_MOTION_OPTIONS["init_min_tri_angle"],
-            FORWARD_MOTION_OPTIONS["init_max_forward_motion"],
-        )
+    first = _Limits(INITIAL_MIN_INLIERS, min_angle, max_forward_motion)
     fewer = replace(first, min_inliers=first.min_inliers // 2)
     return first, fewer, replace(fewer, min_angle=fewer.min_angle / 2)
+
+
+_DEFAULT_LIMITS = _limits(INITIAL_MIN_ANGLE, INITIAL_MAX_FORWARD_MOTION)
+_FORWARD_LIMITS = _limits(
+    FORWARD_MOTION_OPTIONS["init_min_tri_angle"], FORWARD_MOTION_OPTIONS["init_max_forward_motion"]
+)
 
 
 @dataclass(frozen=True)
@@ -238,6 +238,9 @@ def bad_initial_pairs(
 ) -> list[int]:
     """Find initial pairs with a wrong pose, or with intrinsics that diverge in an adjustment.
 
+    If the camera moves along its axis, they are bad with the mapper's default limits or with those
+    that `match` prints: users may leave the options out.
+
     The mapper first adjusts focal length and distortion to two images alone. If their matches do
     not determine these, the values may end anywhere: no third image registers, and the mapper
     writes the two images as its first model. Pairs are tried in the mapper's order, for each image
@@ -260,9 +263,23 @@ def bad_initial_pairs(
         and no pair meets the mapper's first limits, all pairs with few inliers are among them,
         except those of the first model that are certainly stable.
     """
+    bad = _bad_pairs(matched, cameras, known, misleading, every=_DEFAULT_LIMITS)
+    if matched.forward_motion:
+        bad |= _bad_pairs(matched, cameras, known, misleading, every=_FORWARD_LIMITS)
+    return sorted(bad)
+
+
+def _bad_pairs(
+    matched: MatchedImages,
+    cameras: Sequence[pycolmap.Camera],
+    known: KnownPoses,
+    misleading: Mapping[int, float],
+    *,
+    every: Sequence[_Limits],
+) -> set[int]:
+    """The bad pairs for a mapper with the given limits, see `bad_initial_pairs`."""
     counts = np.array([len(own.inlier_matches) for own in matched.geometries], dtype=np.intp)
     bad, sure = set[int](), set[int]()
-    every = _limits(matched)
     for limits in every:
         # Pairs that the mapper rejects keep their inliers, however wrong their pose is.
         bad |= {
@@ -286,7 +303,7 @@ def bad_initial_pairs(
         apart = np.diff(matched.pairs.reshape(-1, 2), axis=1)[:, 0] > _NEIGHBOURS
         few = (counts >= INITIAL_MIN_INLIERS // 2) & (counts < INITIAL_MIN_INLIERS)
         bad |= set(np.flatnonzero(apart & few).tolist()) - sure
-    return sorted(bad)
+    return bad
 
 
 def _starts(
