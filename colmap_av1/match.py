@@ -31,7 +31,7 @@ from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.initial_adjustment import KnownPoses
 from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
 from colmap_av1.matching.links import LinkReport
-from colmap_av1.matching.mapper_limits import FORWARD_MOTION_OPTIONS
+from colmap_av1.matching.mapper_limits import forward_motion_words
 from colmap_av1.matching.match_images import (
     ImageMatches,
     ImageMatchOptions,
@@ -148,11 +148,7 @@ class MatchReport:
         ]
         if self.forward_motion:
             mapper += [
-                *(
-                    word
-                    for name, value in FORWARD_MOTION_OPTIONS.items()
-                    for word in (f"--Mapper.{name}", f"{value:g}")
-                ),
+                *forward_motion_words(),
                 "--Mapper.ba_refine_focal_length", "0",
                 "--Mapper.ba_refine_extra_params", "0",
             ]

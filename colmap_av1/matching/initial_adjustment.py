@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -76,7 +77,7 @@ class _Limits:
         """Whether a pose meets the limits of angle and forward motion, within a margin."""
         forward_margin = _FORWARD_MARGIN if margin < 1 else -_FORWARD_MARGIN
         is_aside = abs(pose[2, 3]) <= self.max_forward_motion + forward_margin
-        return bool(angle >= margin * self.min_angle) and (is_aside or self.max_forward_motion >= 1)
+        return bool(is_aside and angle >= margin * self.min_angle)
 
 
 def _limits(min_angle: float, max_forward_motion: float) -> tuple[_Limits, ...]:
@@ -87,9 +88,8 @@ def _limits(min_angle: float, max_forward_motion: float) -> tuple[_Limits, ...]:
 
 
 _DEFAULT_LIMITS = _limits(INITIAL_MIN_ANGLE, INITIAL_MAX_FORWARD_MOTION)
-_FORWARD_LIMITS = _limits(
-    FORWARD_MOTION_OPTIONS["init_min_tri_angle"], FORWARD_MOTION_OPTIONS["init_max_forward_motion"]
-)
+# The printed init_max_forward_motion excludes no pair.
+_FORWARD_LIMITS = _limits(FORWARD_MOTION_OPTIONS["init_min_tri_angle"], math.inf)
 
 
 @dataclass(frozen=True)

@@ -19,3 +19,9 @@ FORWARD_MOTION_OPTIONS = {
     "init_max_forward_motion": 1.0,
     "init_min_tri_angle": INITIAL_LEAST_ANGLE,
 }
+
+
+def forward_motion_words() -> list[str]:
+    """`FORWARD_MOTION_OPTIONS` as words of a command line of COLMAP's mapper."""
+    options = FORWARD_MOTION_OPTIONS.items()
+    return [word for name, value in options for word in (f"--Mapper.{name}", f"{value:g}")]

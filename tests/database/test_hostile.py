@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import sqlite3
 import struct
 import time
@@ -87,7 +88,7 @@ ENDLESS = (
     "CREATE VIEW {0} AS WITH RECURSIVE n({1}) AS (SELECT 1, 1, 2, X'0000000000000000' UNION ALL "
     "SELECT {2} + 1, rows, cols, data FROM n) SELECT * FROM n"
 )
-# Changes, words one of which the error of `check` has, and whether every reader and writer fails.
+# Changes, a pattern that the error of `check` matches, and whether every reader and writer fails.
 SQL = {
     "schema not in UTF-8": (
         [
@@ -142,7 +143,7 @@ SQL = {
             "CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT, camera_id INTEGER)",
             "INSERT INTO images SELECT image_id, 'a.png', camera_id FROM other",
         ],
-        "'a.png'",
+        r"'a\.png'",
         False,
     ),
     "parameters of 1 byte": (["UPDATE cameras SET params = X'00'"], "parameters", False),
@@ -243,9 +244,9 @@ def messages(path: Path, folder: Path) -> dict[str, str]:
     return found
 
 
-@pytest.mark.parametrize(("changes", "words", "by_all"), SQL.values(), ids=SQL.keys())
+@pytest.mark.parametrize(("changes", "pattern", "by_all"), SQL.values(), ids=SQL.keys())
 def test_malicious_database_is_refused_in_one_line(
-    tmp_path: Path, sound: bytes, changes: list[str], words: str, by_all: bool
+    tmp_path: Path, sound: bytes, changes: list[str], pattern: str, by_all: bool
 ) -> None:
     path = tmp_path / "a.db"
     path.write_bytes(sound)
@@ -254,7 +255,7 @@ def test_malicious_database_is_refused_in_one_line(
             connection.execute(sql)
     found = messages(path, tmp_path)
     assert "check" in found
-    assert any(word in found["check"] for word in words.split("|")), found
+    assert re.search(pattern, found["check"]), found
     # Functions that do not read the damaged part may succeed.
     if by_all:
         assert len(found) == len(readers_and_writers(path, tmp_path)), found.keys()
