@@ -48,7 +48,12 @@ class FurtherPoses:
 
 
 def further_poses(
-    run: Run, first: Posed, image_set: ImageSet, read_tracks: Callable[[], Sequence[Tracks]]
+    run: Run,
+    first: Posed,
+    image_set: ImageSet,
+    read_tracks: Callable[[], Sequence[Tracks]],
+    *,
+    map_again: bool,
 ) -> Iterator[FurtherPoses]:
     """Yield the poses of the models that are not connected to the first.
 
@@ -62,6 +67,7 @@ def further_poses(
         image_set: all images.
         read_tracks: reads the tracks of each video. They are large, so they are not kept between
             the models.
+        map_again: map the models again from their observations, see `remapping`.
     """
     left = set(image_set.images.names) - _registered(run, first)
     waiting = _other_models(run, first)
@@ -85,7 +91,8 @@ def further_poses(
                 keyed=_named(image_set, known),
                 has_picture_positions=first.has_picture_positions,
             )
-            posed = remapped_poses(own, posed, some, least_kept=_LEAST_KEPT)
+            if map_again:
+                posed = remapped_poses(own, posed, some, least_kept=_LEAST_KEPT)
             posed = split_at_seams(own, posed, some)
         except ModelError:  # too few tracks agree with these poses
             continue

@@ -148,7 +148,11 @@ def match_jointly(
     if far is not None and far.apart:
         raise ModelError("images far apart in time contradict the poses")
     models = [_model_of(run, posed, image_set)]
-    for own in further_poses(run, posed, image_set, lambda: [v.tracks for v in videos]):
+    # A second mapping would join images across turns, which the mapper of the database then bends.
+    further = further_poses(
+        run, posed, image_set, lambda: [v.tracks for v in videos], map_again=False
+    )
+    for own in further:
         models.append(_model_of(own.run, own.posed, own.image_set))
     models.sort(key=lambda model: -len(model.placed.images))
     registered = {image.name for model in models for image in model.placed.images}

@@ -4,8 +4,8 @@ Bundle adjustment converges to a local minimum. If few tracks cross a fast turn,
 may be bent, and bundle adjustment does not straighten it. Even so, the corners that were found with
 its poses form longer and more accurate tracks than the motion that it was mapped from. A model that
 is mapped from these is usually less bent. Its cost may be about the same, because hardly any points
-carry the scale across such a turn. Models that are not connected to the first are always mapped
-again: few points determine them.
+carry the scale across such a turn. `reconstruct` always maps models again that are not connected to
+the first: few points determine them.
 """
 
 from __future__ import annotations

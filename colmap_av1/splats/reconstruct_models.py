@@ -78,7 +78,7 @@ def further_models(
     def tracks() -> list[Tracks]:
         return [read_tracks_only(run, video) for video in range(len(run.sources))]
 
-    for own in further_poses(run, first, image_set, tracks):
+    for own in further_poses(run, first, image_set, tracks, map_again=True):
         index = np.searchsorted(image_set.images.frames, own.image_set.images.frames)
         assert run.positions is not None
         placing = replace(own.run, positions=run.positions.some(index))
