@@ -30,7 +30,7 @@ from colmap_av1.matching.gaps import fast_frames, matching_warnings
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.initial_adjustment import KnownPoses
 from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
-from colmap_av1.matching.links import LinkReport
+from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.mapper_limits import forward_motion_words
 from colmap_av1.matching.match_images import (
     ImageMatches,

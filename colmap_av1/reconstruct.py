@@ -22,7 +22,7 @@ from colmap_av1.images.inputs import paths_of, read_inputs
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
-from colmap_av1.matching.links import LinkReport
+from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.options import MatchOptions, ReconstructOptions
 from colmap_av1.poses.estimate import Posed, estimate_poses
 from colmap_av1.poses.placing.placement import Place

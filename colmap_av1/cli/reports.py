@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # these modules are slow to import
     from colmap_av1.evaluate.report.results import CompareReport
     from colmap_av1.map import MapReport
     from colmap_av1.match import MatchReport
-    from colmap_av1.matching.links import LinkReport
+    from colmap_av1.matching.links.report import LinkReport
     from colmap_av1.matching.shutter.of_video import VideoReadOut
     from colmap_av1.motion.info import StreamReport
     from colmap_av1.poses.joint_matches import JointEstimate
@@ -212,7 +212,7 @@ def _link_rows(links: LinkReport) -> Rows:
 
 def _named(gap: Sequence[int], videos: Sequence[tuple[str, int]]) -> str:
     """The frames of a gap, counted from the start of their video, with its name if several."""
-    from colmap_av1.matching.links import gap_in_video
+    from colmap_av1.matching.links.report import gap_in_video
 
     name, before, after = gap_in_video(gap, videos)
     return f"{name} {before}-{after}".strip()

@@ -21,7 +21,8 @@ from colmap_av1.matching.image_matches import (
     pair_images,
     verify_images,
 )
-from colmap_av1.matching.links import LinkReport, link_images
+from colmap_av1.matching.links.link_images import link_images
+from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.options import LinkOptions, PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.run_context import RunContext

@@ -17,7 +17,7 @@ from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file, natural_order
 from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.sift import Features, extract_features, masked_features
-from colmap_av1.matching.links import match_pairs
+from colmap_av1.matching.links.matching import match_pairs
 from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.options import VerifyOptions
 from colmap_av1.util.progress import Progress, no_progress

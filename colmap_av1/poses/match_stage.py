@@ -15,7 +15,7 @@ from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.image_matches import PairedImages
-from colmap_av1.matching.links import LinkReport
+from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.match_images import (
     ImageMatches,
     ImageMatchOptions,

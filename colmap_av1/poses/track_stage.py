@@ -19,7 +19,7 @@ from colmap_av1.images.key_images import key_images, spread_images
 from colmap_av1.images.names import image_names
 from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
 from colmap_av1.matching.gaps import fast_frames
-from colmap_av1.matching.links import images_to_link
+from colmap_av1.matching.links.plan import images_to_link
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter, shutter_settings
 from colmap_av1.options import EncodeOptions, RefineOptions, TrackingOptions
 from colmap_av1.poses.run import Run

@@ -28,7 +28,8 @@ from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.match import MatchReport, match
 from colmap_av1.matching.features.retrieval import similar_images
 from colmap_av1.matching.features.sift import Features, extract_features, match_features
-from colmap_av1.matching.links import Links, links_as_tracks
+from colmap_av1.matching.links.matching import Links
+from colmap_av1.matching.links.merging import links_as_tracks
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import (
     CameraOptions,

@@ -56,7 +56,7 @@ def test_cut_to_a_known_place_is_linked_with_few_features(
     shared: Path, encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The two images at the cut show nothing in common, but other images do."""
-    monkeypatch.delattr("colmap_av1.matching.links.thorough_plan")
+    monkeypatch.delattr("colmap_av1.matching.links.link_images.thorough_plan")
     clip = pictures(shared / "sequences" / "log_building" / "clip.mp4")
     cut = encode(
         np.array([*clip[66:], *clip[6:30], *clip[46:60]]), tmp_path / "cut.mp4", *QUICK_AV1
