@@ -179,6 +179,13 @@ def publish(output: Output, folder: Path, name: str, report: dict[str, object]) 
     output.remove(f"{name}/{_UNFINISHED}")
 
 
+def remove_list_of_unfinished(output: Output, name: str) -> None:
+    """Remove the list of files from a finished video's folder, if a killed run has left it."""
+    path = f"{name}/{_UNFINISHED}"
+    if output.read(path) is not None:
+        output.remove(path)
+
+
 def earlier_report(output: Output, name: str) -> dict[str, Any] | None:
     """The report of a finished video; None if no batch has written one."""
     try:

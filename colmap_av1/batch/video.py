@@ -14,7 +14,7 @@ import imageio_ffmpeg
 
 from colmap_av1.batch.command import CommandFailedError, Processes, run_command
 from colmap_av1.batch.inputs import Video
-from colmap_av1.batch.output import earlier_report, output_at, publish
+from colmap_av1.batch.output import earlier_report, output_at, publish, remove_list_of_unfinished
 from colmap_av1.batch.rows import Row, row_of
 from colmap_av1.errors import ModelError, OptionError, VideoError
 from colmap_av1.options import BatchOptions, MatchOptions
@@ -132,6 +132,7 @@ def _attempt(work: Work, video: Video, threads: int, processes: Processes) -> Ou
             row = dataclasses.replace(
                 row_of(earlier["row"]), name=video.name, input=without_secrets(video.address)
             )
+            remove_list_of_unfinished(output, video.name)
             return Outcome(row, kept=True)
     with scratch_folder(Path(work.scratch) / SCRATCH) as scratch:
         folder, copies = scratch / "output", scratch / "input"

@@ -195,6 +195,18 @@ def test_unfinished_folder_of_a_video_is_completed(clips: Path, tmp_path: Path) 
     assert files_of(out) == whole
 
 
+def test_list_of_unfinished_files_is_removed_from_finished_videos(
+    clips: Path, tmp_path: Path
+) -> None:
+    """A process that is killed after writing the report leaves the list."""
+    out, video = tmp_path / "out", clips / "a" / "clip0.mp4"
+    run_batch(video, out, ReadOptions(), options=ONCE)
+    whole = files_of(out)
+    (out / "clip0" / ".unfinished").write_text(json.dumps(["report.json"]))
+    assert run_batch(video, out, ReadOptions(), options=ONCE).num_kept == 1
+    assert files_of(out) == whole
+
+
 def test_folder_that_cannot_be_created_fails_only_its_video(clips: Path, tmp_path: Path) -> None:
     """An output that cannot be created is an error of the batch."""
     videos, out = tmp_path / "videos", tmp_path / "out"
