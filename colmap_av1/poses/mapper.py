@@ -67,7 +67,6 @@ def map_poses(
     log: Path,
     num_images: int,
     progress: Progress,
-    start_tracks: int | None = None,
     ends_early: bool = False,
 ) -> tuple[int, ...]:
     """Map a database in a separate process, see `run_mapper`.
@@ -80,8 +79,6 @@ def map_poses(
         log: file for the output of the mapper.
         num_images: number of images, for the progress.
         progress: called in the stage "poses" with the number of images registered so far.
-        start_tracks: number of tracks per image, the longest ones, that the global mapper starts
-            from; the others are triangulated and adjusted afterwards. None uses all.
         ends_early: end global bundle adjustment early, because the poses are adjusted later.
 
     Returns:
@@ -92,8 +89,7 @@ def map_poses(
     """
     output.mkdir(parents=True, exist_ok=True)
     settings = _mapping_settings(database, output, options, image_path)
-    tolerance = _MAPPER_TOLERANCE if ends_early else None
-    settings |= {"start_tracks": start_tracks, "tolerance": tolerance}
+    settings["tolerance"] = _MAPPER_TOLERANCE if ends_early else None
     progress("poses", 0, num_images)
     sizes: list[int] = []
     placed = 0
@@ -150,9 +146,46 @@ def _mapping_settings(
         "initial_pair": FORWARD_MOTION_OPTIONS if options.forward_motion else {},
         "seed": options.seed,
         "num_threads": threads_or_cpus(options.num_threads),
-        "start_tracks": None,
         "tolerance": None,
     }
+
+
+def start_mapper(
+    database: Path,
+    options: MapOptions,
+    num_images: int,
+    *,
+    log: Path,
+    initial_pair: dict[str, float],
+) -> list[str] | None:
+    """Run the incremental mapper on a database until its first model has a number of images.
+
+    Args:
+        database: COLMAP database with verified matches; pycolmap migrates it to its schema.
+        options: options of the mapper.
+        num_images: number of images at which the mapper is stopped.
+        log: file for the output of the mapper.
+        initial_pair: limits for the initial pair, in addition to the options.
+
+    Returns:
+        Names of the images of a first model that remains smaller; None if it does not, or if the
+        mapper starts none.
+
+    Raises:
+        ModelError: the mapper failed; the log holds the details.
+    """
+    settings = _mapping_settings(database, database.parent, options, None)
+    settings |= {"task": "start", "num_images": num_images}
+    settings["initial_pair"] = {**initial_pair, **settings["initial_pair"]}
+    names: list[str] | None = None
+
+    def hear(word: str, value: str) -> None:
+        nonlocal names
+        if word == "names":
+            names = json.loads(value)
+
+    _run_in_process(settings, hear, log, failed="COLMAP's mapper", hint="try --verify pairs")
+    return names
 
 
 def adjust_model(

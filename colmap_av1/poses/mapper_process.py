@@ -29,6 +29,8 @@ def run_child(settings: dict[str, Any]) -> None:
     try:
         if settings["task"] == "adjustment":
             _adjust(settings)
+        elif settings["task"] == "start":
+            print("names", json.dumps(_start(settings)), file=channel)
         else:
             found = run_mapping(settings, lambda: print("placed", file=channel))
             print("models", json.dumps(found), file=channel)
@@ -59,16 +61,11 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
     each = output / "each"
     each.mkdir()
     if settings["mapper"] == "incremental":
-        how = pycolmap.IncrementalPipelineOptions(**common)
-        how.extract_colors = False
-        how.ba_refine_focal_length = refine
-        how.ba_refine_extra_params = refine
+        how = _incremental_options(settings)
         how.mapper.abs_pose_refine_focal_length = refine
         how.mapper.abs_pose_refine_extra_params = refine
         if settings["tolerance"] is not None:
             how.ba_global_function_tolerance = settings["tolerance"]
-        for name, value in settings["initial_pair"].items():
-            setattr(how.mapper, name, value)
         # pycolmap accepts None for a callback, although its stub does not declare it.
         callbacks: Any = {"initial_image_pair_callback": placed, "next_image_callback": placed}
         models = pycolmap.incremental_mapping(database, each, each, options=how, **callbacks)
@@ -79,8 +76,6 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
         adjustment.refine_extra_params = refine
         if settings["tolerance"] is not None:
             adjustment.ceres.solver_options.function_tolerance = settings["tolerance"]
-        if settings["start_tracks"] is not None:
-            global_options.mapper.track_required_tracks_per_view = settings["start_tracks"]
         models = pycolmap.global_mapping(database, each, each, options=global_options)
     shutil.rmtree(each)
     found = sorted(models.values(), key=lambda m: -m.num_reg_images())
@@ -91,6 +86,57 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
         folder.mkdir()
         model.write_binary(folder)
     return [model.num_reg_images() for model in found]
+
+
+def _incremental_options(settings: dict[str, Any]) -> Any:
+    """Options of the incremental mapper."""
+    import pycolmap  # noqa: PLC0415 - after the redirection in run_child
+
+    how = pycolmap.IncrementalPipelineOptions(
+        random_seed=settings["seed"], num_threads=settings["num_threads"]
+    )
+    how.extract_colors = False
+    how.ba_refine_focal_length = settings["refine_intrinsics"]
+    how.ba_refine_extra_params = settings["refine_intrinsics"]
+    for name, value in settings["initial_pair"].items():
+        setattr(how.mapper, name, value)
+    return how
+
+
+class _EnoughImagesError(Exception):
+    """The first model has enough images."""
+
+
+def _start(settings: dict[str, Any]) -> list[str] | None:
+    """Begin to map, see `start_mapper`."""
+    import pycolmap  # noqa: PLC0415 - after the redirection in run_child
+
+    num_images = 0
+
+    def start() -> None:
+        nonlocal num_images
+        num_images = 2
+
+    def go_on() -> None:
+        nonlocal num_images
+        num_images += 1
+        if num_images >= settings["num_images"]:
+            raise _EnoughImagesError
+
+    how = _incremental_options(settings)
+    how.multiple_models = False
+    output = Path(settings["model"]) / "start"
+    output.mkdir(exist_ok=True)
+    callbacks: Any = {"initial_image_pair_callback": start, "next_image_callback": go_on}
+    try:
+        models = pycolmap.incremental_mapping(
+            settings["database"], output, output, options=how, **callbacks
+        )
+    except _EnoughImagesError:
+        return None
+    if not models:
+        return None
+    return [image.name for image in models[0].images.values() if image.has_pose]
 
 
 def _adjust(settings: dict[str, Any]) -> None:

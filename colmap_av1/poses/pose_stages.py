@@ -48,6 +48,7 @@ from colmap_av1.poses.posed_images import (
 )
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.seams import model_seams
+from colmap_av1.poses.start_tracks import START_TRACKS, keep_start_tracks
 from colmap_av1.poses.track_stage import LEAST_IMAGES, pose_tracks
 from colmap_av1.poses.zoom import with_own_cameras
 from colmap_av1.tracks.selection import select_tracks
@@ -57,10 +58,6 @@ from colmap_av1.util.stages import Kept, run_stage
 
 # With fewer tracks per image than this, a failed initialization is blamed on the tracks.
 _FEW_TRACKS = 100
-# The global mapper initializes from this number of tracks per image, the longest ones, which takes
-# half the time of 200, and the adjustment that follows ends at the same poses. All tracks are used
-# where poses depend on links, which are short tracks, and in fast turns, where few tracks are long.
-START_TRACKS = 100
 # The selection of tracks for bundle adjustment.
 _ADJUSTED = DensityOptions(
     preset="sparse", max_tracks_per_image=500, spacing=12.0, min_images=3, max_sigma=0.0
@@ -138,7 +135,6 @@ def pose_stage(
     links = found_before.links
     reasons = {reason for gap in links.gaps for reason in gap.reasons}
     depends_on_links = links.num_between or reasons & {"contradicted", "few tracks"}
-    start_tracks = None if depends_on_links or links.fast else START_TRACKS
     # Where poses depend on links, walks with fast turns bend if the mapper ends early.
     ends_early = mapping.adjust and not depends_on_links
     attempts = [
@@ -162,7 +158,6 @@ def pose_stage(
                 log=run.stages / "mapper.log",
                 num_images=len(keyed.images.names),
                 progress=progress,
-                start_tracks=start_tracks,
                 ends_early=ends_early,
             )
             return [
@@ -177,7 +172,12 @@ def pose_stage(
             copy = partial / "mapped.db"
             shutil.copyfile(run.output / "database.db", copy)
             for attempt in attempts:
-                found = map_with(attempt, copy)
+                database = copy
+                if attempt.mapper == "global" and mapping.adjust:
+                    database = partial / "few_tracks.db"
+                    shutil.copyfile(copy, database)
+                    keep_start_tracks(database)
+                found = map_with(attempt, database)
                 if found:
                     break
         if not found:
@@ -198,7 +198,7 @@ def pose_stage(
     return run_stage(
         run.stages,
         "poses",
-        [matched.digest, attempts, start_tracks, ends_early, pycolmap.__version__],
+        [matched.digest, attempts, START_TRACKS, mapping.adjust, ends_early, pycolmap.__version__],
         MappedResult,
         into=run.stages,
         products=["poses"],

@@ -37,12 +37,12 @@ from colmap_av1.poses.adjusting import LOSS_SCALES, adjust_posed, refines_intrin
 from colmap_av1.poses.mapper import map_poses
 from colmap_av1.poses.pose_stages import (
     FROM_PICTURES,
-    START_TRACKS,
     AdjustedResult,
     MappedResult,
 )
 from colmap_av1.poses.posed_images import posed_images_of, registered_by_video, triangulate_in
 from colmap_av1.poses.run import Run
+from colmap_av1.poses.start_tracks import START_TRACKS, keep_start_tracks
 from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
@@ -158,6 +158,7 @@ def _map_tracks(
     with tempfile.TemporaryDirectory() as folder:
         database, models = Path(folder) / "database.db", Path(folder) / "models"
         write_matched_images(database, [i.name for i in known.images], cameras, matched)
+        keep_start_tracks(database)
         sizes = map_poses(
             database,
             models,
@@ -171,7 +172,6 @@ def _map_tracks(
             log=run.stages / "mapper.log",
             num_images=len(known.images),
             progress=run.progress,
-            start_tracks=START_TRACKS,
             ends_early=True,
         )
         return _with_camera_ids(posed_model(read_model(models / "0")), known) if sizes else None

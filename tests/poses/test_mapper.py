@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import re
 import sys
 from pathlib import Path
 
@@ -50,43 +49,6 @@ def test_failing_mapper_names_its_log(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="log"):
         run_mapper(tmp_path, tmp_path / "no.db", "global", no_progress)
     assert (tmp_path / "log").stat().st_size > 0
-
-
-def test_mapper_starts_from_the_longest_tracks(
-    made: ReconstructReport, truth: Truth, tmp_path: Path
-) -> None:
-    """Shorter tracks are left out of the first mapping, but their points are added later."""
-    found = {}
-    for start_tracks in (None, 40):
-        folder = tmp_path / str(start_tracks)
-        folder.mkdir()
-        copy = folder / "mapped.db"
-        copy.write_bytes(made.database.read_bytes())
-        sizes = mapper_module.map_poses(
-            copy,
-            folder / "poses",
-            MapOptions(mapper="global", num_threads=1),
-            image_path=None,
-            log=folder / "log",
-            num_images=NUM_IMAGES,
-            progress=no_progress,
-            start_tracks=start_tracks,
-        )
-        model = read_model(folder / "poses" / "0")
-        counts = re.search(r"Before filtering: (\d+), after filtering: (\d+)", log_of(folder))
-        assert counts is not None
-        error = pose_errors(model_poses(model, 60), truth.cam_from_world)
-        found[start_tracks] = (sizes, [int(n) for n in counts.groups()], model, error)
-    (sizes, (before, after), whole, error), (few_sizes, few, model, few_error) = found.values()
-    assert few_sizes == sizes == (made.num_key_images,)
-    assert (few[0], after) == (before, before)
-    assert few[1] < before / 2
-    assert model.num_points3D() > 0.9 * whole.num_points3D()
-    assert few_error.rotation < 2 * error.rotation
-
-
-def log_of(folder: Path) -> str:
-    return (folder / "log").read_text()
 
 
 def adjusted_model(made: ReconstructReport, folder: Path) -> pycolmap.Reconstruction:
