@@ -256,11 +256,15 @@ def trusted_tracks(
 
 
 def _is_doubtful(posed: Posed) -> bool:
-    """Whether links replace motion, and points connect the adjusted model poorly somewhere."""
+    """Whether the adjusted model may be bent where links replace motion.
+
+    Either points connect it poorly somewhere, or it was mapped with a guessed focal length.
+    """
     if posed.adjustment is None:
         return False
-    links, adjusted = posed.matches.result.links, posed.adjustment.result
-    return bool((links.gaps or links.fast) and (adjusted.doubtful_seams or adjusted.turns))
+    matches, adjusted = posed.matches.result, posed.adjustment.result
+    is_weak = adjusted.doubtful_seams or adjusted.turns or matches.guessed
+    return bool((matches.links.gaps or matches.links.fast) and is_weak)
 
 
 def remapped_poses(run: Run, posed: Posed, image_set: ImageSet, *, least_kept: float) -> Posed:
