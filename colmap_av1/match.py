@@ -28,8 +28,7 @@ from colmap_av1.images.recognising import check_content
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.gaps import fast_frames, matching_warnings
 from colmap_av1.matching.image_matches import PairedImages
-from colmap_av1.matching.initial_adjustment import KnownPoses
-from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
+from colmap_av1.matching.initial_pairs import KnownPoses, demote_bad_initial_pairs
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.mapper_limits import forward_motion_words
 from colmap_av1.matching.match_images import (
@@ -42,6 +41,7 @@ from colmap_av1.matching.shutter.correct import correct_rolling_shutter
 from colmap_av1.options import ImageOptions, MatchOptions, PairOptions, ReconstructOptions
 from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
 from colmap_av1.poses.run import Run
+from colmap_av1.poses.start_trials import demote_failing_starts
 from colmap_av1.poses.track_stage import VideoTracks, encoding_for_pictures
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import least_length
@@ -245,10 +245,19 @@ def match(
         cameras = _listed_cameras(database, listed, images) if listed else None
         found = _match_images(images, cameras, scratch, options, context)
         known = KnownPoses()
-        if isinstance(found, JointMatches):
-            has_focal_lengths = all(camera.has_prior_focal_length for camera in found.cameras)
-            known = KnownPoses(found.poses, are_comparable=has_focal_lengths)
-        written = demote_bad_initial_pairs(found.matched, found.cameras, clock, known)
+        # The poses of pairs are wrong if a focal length is a guess.
+        has_focal_lengths = all(camera.has_prior_focal_length for camera in found.cameras)
+        if isinstance(found, JointMatches) and has_focal_lengths:
+            known = KnownPoses(found.poses)
+        written, has_start = demote_bad_initial_pairs(found.matched, found.cameras, clock, known)
+        names = images.image_set.images.names
+        crash = None
+        try:
+            written = demote_failing_starts(
+                written, names, found.cameras, context, meets_first_limits=has_start
+            )
+        except ModelError as error:
+            crash = f"COLMAP's mapper may fail on this database: {error}"
         num_written, blurred = 0, list[str]()
         if folder is not None:
             check_videos()
@@ -263,7 +272,7 @@ def match(
         positions = image_positions(images.image_set, inputs.videos, inputs.photos)
         write_matched_images(
             database,
-            images.image_set.images.names,
+            names,
             None if listed else found.cameras,
             written,
             on_existing=options.on_existing,
@@ -274,7 +283,7 @@ def match(
     num_inliers = [len(geometry.inlier_matches) for geometry in written.geometries]
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
     notes += (*positions.warnings, *found.warnings)
-    doubts = (found.depth.warning, focal_length_warning(found.cameras))
+    doubts = (crash, found.depth.warning, focal_length_warning(found.cameras))
     notes += tuple(doubt for doubt in doubts if doubt is not None)
     # Few matches do not mean a gap if existing matches of the database may connect the images, or
     # with a joint estimate, which omits matches that only repeat tracks of other pairs.

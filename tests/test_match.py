@@ -25,6 +25,7 @@ from colmap_av1.errors import (
     ColmapAv1Error,
     DatabaseError,
     ImageError,
+    ModelError,
     OptionError,
     VideoError,
 )
@@ -282,6 +283,18 @@ def test_truncated_stream_is_used_up_to_the_damage(
     refined = match(tmp_path / "b.db", cut, options=LK)
     assert refined.num_frames == report.num_frames
     assert refined.num_observations == report.num_observations
+
+
+def test_database_is_written_although_the_mapper_crashes(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def crash(*args: object, **options: object) -> None:
+        raise ModelError("the mapper stopped")
+
+    monkeypatch.setattr("colmap_av1.poses.start_trials.start_mapper", crash)
+    report = match(tmp_path / "a.db", clip)
+    assert any("stopped" in warning for warning in report.warnings)
+    assert len(read_images(tmp_path / "a.db")) == report.num_images
 
 
 def test_locked_database_is_reported_and_not_changed(clip: Path, tmp_path: Path) -> None:

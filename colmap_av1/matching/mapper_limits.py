@@ -8,8 +8,11 @@ MIN_INLIERS = 15
 INITIAL_MIN_INLIERS = 100
 INITIAL_MAX_FORWARD_MOTION = 0.95
 INITIAL_MIN_ANGLE = 16.0
-# Fewest points with that angle: registering the third image needs them (abs_pose_min_num_inliers).
-INITIAL_MIN_POINTS = 30
+# If no pair meets these limits, the mapper halves the number of inliers, then the angle.
+LOWER_INITIAL_LIMITS = {
+    "init_min_num_inliers": INITIAL_MIN_INLIERS // 2,
+    "init_min_tri_angle": INITIAL_MIN_ANGLE / 2,
+}
 # If no pair has that angle, the mapper halves it twice.
 INITIAL_LEAST_ANGLE = INITIAL_MIN_ANGLE / 4
 # The mapper's options for the initial pair if the camera moves along its axis, as on a drive. Its

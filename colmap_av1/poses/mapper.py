@@ -184,7 +184,8 @@ def start_mapper(
         if word == "names":
             names = json.loads(value)
 
-    _run_in_process(settings, hear, log, failed="COLMAP's mapper", hint="try --verify pairs")
+    hint = "'colmap mapper' shows more"
+    _run_in_process(settings, hear, log, failed="COLMAP's incremental mapper", hint=hint)
     return names
 
 

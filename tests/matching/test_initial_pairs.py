@@ -11,8 +11,7 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_adjustment import KnownPoses
-from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
+from colmap_av1.matching.initial_pairs import KnownPoses, demote_bad_initial_pairs
 from colmap_av1.matching.mapper_limits import INITIAL_MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
@@ -65,7 +64,7 @@ def verified(keypoints: list[ImageKeypoints], matches: NDArray[np.uint32]) -> Tw
 
 def demoted(keypoints: list[ImageKeypoints], geometry: TwoViewGeometry) -> TwoViewGeometry:
     matched = MatchedImages(keypoints, PAIR, [geometry.inlier_matches], [geometry], False)
-    return demote_bad_initial_pairs(matched, [CAMERA] * 2, Clock()).geometries[0]
+    return demote_bad_initial_pairs(matched, [CAMERA] * 2, Clock())[0].geometries[0]
 
 
 def angle_of_mapper(keypoints: list[ImageKeypoints], matches: NDArray[np.uint32]) -> float:
@@ -122,56 +121,55 @@ def test_planar_pair_with_unknown_focal_length_is_kept() -> None:
     assert demoted(keypoints, geometry) is geometry
 
 
-def test_pair_whose_camera_would_diverge_is_demoted() -> None:
-    """About a hundred matches do not determine the focal length and the distortion here.
-
-    Without a better pair, such a pair is kept: demoting it would gain nothing.
-    """
-    rng = np.random.default_rng(4)
-    better = turned_views(0.25, 0.3, 400, rng)
-    num_demoted = 0
-    for _ in range(10):
-        narrow = turned_views(0.1, 0.02, 120, rng)
-        pairs = [narrow, better]
-        keypoints = [k for own, _ in pairs for k in own]
-        geometries = [verify_pairs(own, PAIR, [m], GUESSED)[0] for own, m in pairs]
-        assert len(geometries[0].inlier_matches) >= INITIAL_MIN_INLIERS
-        both = np.array([[0, 1], [2, 3]], dtype=np.int32)
-        matched = MatchedImages(keypoints, both, [m for _, m in pairs], geometries, False)
-        found = demote_bad_initial_pairs(matched, [GUESSED] * 4, Clock()).geometries
-        assert found[1] is geometries[1]
-        if found[0] is not geometries[0]:
-            num_demoted += 1
-            assert len(found[0].inlier_matches) == INITIAL_MIN_INLIERS // 2 - 1
-        alone = replace(matched, keypoints=narrow[0], pairs=PAIR, geometries=geometries[:1])
-        assert (
-            demote_bad_initial_pairs(alone, [GUESSED] * 2, Clock()).geometries[0] is geometries[0]
-        )
-    assert num_demoted > 5
-
-
-def test_pair_whose_camera_diverges_slowly_is_demoted() -> None:
-    """Focal length and two distortion parameters diverge slowly from two views."""
-    camera = make_camera(CameraOptions(camera_model="RADIAL"), WIDTH, HEIGHT)
-    keypoints, matches = turned_views(0.3, 0.1, 120, np.random.default_rng(1))
-    (geometry,) = verify_pairs(keypoints, PAIR, [matches], camera)
-    matched = MatchedImages(keypoints, PAIR, [matches], [geometry], False)
-    turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
-    poses = [np.eye(3, 4), np.hstack([turn, np.array([[0], [0], [1]]) - turn[:, 2:]])]
-    (found,) = demote_bad_initial_pairs(
-        matched, [camera] * 2, Clock(), KnownPoses([poses], True)
-    ).geometries
-    assert len(geometry.inlier_matches) >= INITIAL_MIN_INLIERS > len(found.inlier_matches)
-
-
-@pytest.mark.parametrize("forward_motion", [False, True])
-def test_pairs_with_few_inliers_are_demoted_if_no_pair_has_a_large_angle(
-    forward_motion: bool,
+@pytest.mark.parametrize(
+    ("turned", "forward_motion", "is_kept"),
+    [(0.0, False, True), (10.0, False, False), (10.0, True, False)],
+)
+def test_pair_with_a_wrong_pose_is_demoted(
+    turned: float, forward_motion: bool, is_kept: bool
 ) -> None:
-    """The mapper would try these first and might start with any of them.
+    rng = np.random.default_rng(3)
+    keypoints, matches = turned_views(0.5, 0.3, 300, rng)
+    geometry = verified(keypoints, matches)
+    matched = MatchedImages(keypoints, PAIR, [matches], [geometry], forward_motion)
+    wrong = Rotation.from_euler("y", turned + 20, degrees=True).as_matrix()
+    poses = [np.eye(3, 4), np.hstack([wrong, [[0], [0], [1]]])]
+    found, meets_first_limits = demote_bad_initial_pairs(
+        matched, [CAMERA] * 2, Clock(), KnownPoses([poses])
+    )
+    count = len(found.geometries[0].inlier_matches)
+    assert (count == len(geometry.inlier_matches)) == is_kept == meets_first_limits
+    assert count >= 40
+    assert is_kept or count < INITIAL_MIN_INLIERS / 2
 
-    Databases of drives may be mapped without the options for drives.
-    """
+
+def test_wrong_pair_below_the_angle_of_a_good_pair_is_kept() -> None:
+    """The mapper starts with the good pair before it lowers its limits to the wrong one."""
+    rng = np.random.default_rng(3)
+    wide, narrow = turned_views(0.5, 0.3, 300, rng), two_views(4.0, rng, 300, 10.0)
+    keypoints = [k for views in (wide, narrow) for k in views[0]]
+    geometries = [verified(*views) for views in (wide, narrow)]
+    pairs = np.array([[0, 1], [2, 3]], dtype=np.int32)
+    turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
+    of_wide = [np.eye(3, 4), np.hstack([turn, [[0], [0], [1]]])]
+    of_narrow = [np.eye(3, 4), np.hstack([turn, [[0], [0], [0]]])]
+    poses = [*of_wide, *of_narrow]
+    for chosen, is_kept in (([0, 1], True), ([1], False)):
+        matched = MatchedImages(
+            keypoints,
+            pairs[chosen],
+            [geometries[k].inlier_matches for k in chosen],
+            [geometries[k] for k in chosen],
+            False,
+        )
+        found, meets_first_limits = demote_bad_initial_pairs(
+            matched, [CAMERA] * 4, Clock(), KnownPoses([poses])
+        )
+        assert (found.geometries[-1] is geometries[1]) == is_kept == meets_first_limits
+
+
+def test_pair_with_few_inliers_and_a_small_angle_is_demoted_if_no_pair_has_a_large_one() -> None:
+    """The mapper would try it before it lowers its limits, and RANSAC may give it a wrong pose."""
     rng = np.random.default_rng(0)
     pairs = np.array([[0, 1], [2, 9], [3, 4]], dtype=np.int32)
     nothing = np.empty((0, 2), np.float32)
@@ -185,51 +183,8 @@ def test_pairs_with_few_inliers_are_demoted_if_no_pair_has_a_large_angle(
         poses[j] = np.column_stack([turn, turn @ [-np.radians(angle), 0, 0]])
         geometries.append(verified(views, matches))
     matched = MatchedImages(
-        keypoints, pairs, [g.inlier_matches for g in geometries], geometries, forward_motion
-    )
-    found = demote_bad_initial_pairs(
-        matched, [CAMERA] * 10, Clock(), KnownPoses([poses], True)
-    ).geometries
-    assert found[0] is geometries[0]
-    assert len(found[1].inlier_matches) == INITIAL_MIN_INLIERS // 2 - 1
-    assert found[2] is geometries[2]
-
-
-def test_mapper_starts_with_a_pair_of_the_first_model() -> None:
-    """The mapper would try the pair with few inliers and a large angle first."""
-    rng = np.random.default_rng(0)
-    pairs = np.array([[0, 1], [2, 9]], dtype=np.int32)
-    nothing = np.empty((0, 2), np.float32)
-    keypoints = [ImageKeypoints(i, nothing, np.arange(0)) for i in range(10)]
-    models: list[list[NDArray[np.float64] | None]] = [[None] * 10, [None] * 10]
-    geometries = []
-    for model, (i, j), count, angle in zip(models, pairs, (400, 80), (12.0, 24.0), strict=True):
-        (keypoints[i], keypoints[j]), matches = two_views(4.0, rng, count, angle)
-        turn = Rotation.from_euler("y", -angle / 2, degrees=True).as_matrix()
-        model[i] = np.eye(3, 4)
-        model[j] = np.column_stack([turn, turn @ [-np.radians(angle), 0, 0]])
-        geometries.append(verified([keypoints[i], keypoints[j]], matches))
-    matched = MatchedImages(
         keypoints, pairs, [g.inlier_matches for g in geometries], geometries, False
     )
-    for known, expected in ((models, [True, False]), (models[::-1], [True, True])):
-        found = demote_bad_initial_pairs(matched, [CAMERA] * 10, Clock(), KnownPoses(known, True))
-        kept = [a is b for a, b in zip(found.geometries, geometries, strict=True)]
-        assert kept == expected
-
-
-def test_pair_with_a_wrong_pose_is_demoted() -> None:
-    rng = np.random.default_rng(3)
-    keypoints, matches = turned_views(0.5, 0.3, 300, rng)
-    geometry = verified(keypoints, matches)
-    matched = MatchedImages(keypoints, PAIR, [matches], [geometry], False)
-    turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
-    for angle, is_kept in ((0, True), (10, False)):
-        wrong = Rotation.from_euler("y", angle, degrees=True).as_matrix()
-        poses = [np.eye(3, 4), np.hstack([wrong @ turn, [[0], [0], [1]]])]
-        (found,) = demote_bad_initial_pairs(
-            matched, [CAMERA] * 2, Clock(), KnownPoses([poses], True)
-        ).geometries
-        count = len(found.inlier_matches)
-        assert (count == len(geometry.inlier_matches)) == is_kept
-        assert count >= 40
+    found, _ = demote_bad_initial_pairs(matched, [CAMERA] * 10, Clock(), KnownPoses([poses]))
+    kept = [a is b for a, b in zip(found.geometries, geometries, strict=True)]
+    assert kept == [True, False, True]
