@@ -84,9 +84,9 @@ def demote_bad_initial_pairs(
     pair keeps enough inliers to connect its images; tracks continue through the pairs between.
     Pairs keep all inliers if the mapper finds a good pair before it lowers its limits to theirs.
 
-    If no pair meets its first limits, it tries hundreds of pairs with few inliers, and RANSAC may
-    give any of them a wrong pose with a large angle. With known poses, those with a small angle are
-    demoted, too, except neighbours, which connect the images.
+    If no pair meets its first limits, it tries hundreds of pairs with few inliers. RANSAC may give
+    any of them a wrong pose with a large angle, or intrinsics may diverge. With known poses, these
+    pairs are demoted, too, except neighbours, which connect the images.
 
     Args:
         matched: the images. The pose of the homography is tested only for pairs with an essential
@@ -122,15 +122,15 @@ def demote_bad_initial_pairs(
             elif count >= _MARGIN * INITIAL_MIN_INLIERS:
                 is_aside = abs(pose[2, 3]) < INITIAL_MAX_FORWARD_MOTION
                 has_start |= is_aside and angle >= _MARGIN * INITIAL_MIN_ANGLE
-            elif angle < _MARGIN * INITIAL_MIN_ANGLE / 2 and abs(pair[1] - pair[0]) > _NEIGHBOURS:
+            if count < _MARGIN * INITIAL_MIN_INLIERS and abs(pair[1] - pair[0]) > _NEIGHBOURS:
                 few.append(k)
         least = INITIAL_MIN_ANGLE if has_start else INITIAL_MIN_ANGLE / 2
         if matched.forward_motion:
             least = min(least, FORWARD_MOTION_OPTIONS["init_min_tri_angle"])
         geometries = list(matched.geometries)
-        bad = [k for k, angle in wrong.items() if angle >= _WIDE_SHARE * least]
+        bad = {k for k, angle in wrong.items() if angle >= _WIDE_SHARE * least}
         if known.models and not has_start:
-            bad += few
+            bad.update(few)
         for k in bad:
             geometries[k] = demoted(geometries[k])
     return replace(matched, geometries=geometries), has_start

@@ -168,7 +168,7 @@ def test_wrong_pair_below_the_angle_of_a_good_pair_is_kept() -> None:
         assert (found.geometries[-1] is geometries[1]) == is_kept == meets_first_limits
 
 
-def test_pair_with_few_inliers_and_a_small_angle_is_demoted_if_no_pair_has_a_large_one() -> None:
+def test_pair_with_few_inliers_is_demoted_if_no_pair_has_a_large_angle() -> None:
     """The mapper would try it before it lowers its limits, and RANSAC may give it a wrong pose."""
     rng = np.random.default_rng(0)
     pairs = np.array([[0, 1], [2, 9], [3, 4]], dtype=np.int32)
