@@ -28,7 +28,7 @@ from colmap_av1.images.recognising import check_content
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.gaps import fast_frames, matching_warnings
 from colmap_av1.matching.image_matches import PairedImages
-from colmap_av1.matching.initial_pairs import KnownPoses, demote_bad_initial_pairs
+from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.mapper_limits import forward_motion_words
 from colmap_av1.matching.match_images import (
@@ -244,11 +244,9 @@ def match(
         )
         cameras = _listed_cameras(database, listed, images) if listed else None
         found = _match_images(images, cameras, scratch, options, context)
-        known = KnownPoses()
         # The poses of pairs are wrong if a focal length is a guess.
         has_focal_lengths = all(camera.has_prior_focal_length for camera in found.cameras)
-        if isinstance(found, JointMatches) and has_focal_lengths:
-            known = KnownPoses(found.poses)
+        known = found.poses if isinstance(found, JointMatches) and has_focal_lengths else ()
         written, has_start = demote_bad_initial_pairs(found.matched, found.cameras, clock, known)
         names = images.image_set.images.names
         crash = None

@@ -30,8 +30,8 @@ _MIN_INLIERS = INITIAL_MIN_INLIERS // 2
 # The mapper estimates poses anew: it certainly accepts a pair that exceeds its limits by the first
 # factor, and may accept one with the second share of the angle.
 _MARGIN, _WIDE_SHARE = 1.1, 0.75
-# Neighbours are at most this many images apart.
-_NEIGHBOURS = 2
+# Neighbours, which keep their inliers to connect the images, are at most this many images apart.
+NEIGHBOURS = 2
 # About this many inliers decide as well as all of them.
 _NUM_SOME = 64
 # A rotation is wrong if it differs from a known one by more than this share of the triangulation
@@ -47,34 +47,11 @@ _ERROR_FACTOR = 1.5
 _ERROR_QUANTILE = 0.9
 
 
-@dataclass(frozen=True)
-class KnownPoses:
-    """Known poses, which the poses of pairs are compared with.
-
-    Attributes:
-        models: for each model, float64 [3, 4] cam_from_world of each image, None if it is not in
-            the model. The relative pose of images in different models is not known.
-    """
-
-    models: Sequence[Sequence[_Floats | None]] = ()
-
-    def rotation(self, pair: Sequence[int]) -> _Floats | None:
-        """The rotation from the first camera of a pair to the second; None if not known."""
-        for cam_from_world in self.models:
-            first, second = (cam_from_world[image] for image in pair)
-            if first is not None and second is not None:
-                return np.asarray(second[:, :3] @ first[:, :3].T)
-        return None
-
-
-_NO_POSES = KnownPoses()
-
-
 def demote_bad_initial_pairs(
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
     clock: Clock,
-    known: KnownPoses = _NO_POSES,
+    known: Sequence[Sequence[_Floats | None]] = (),
 ) -> tuple[MatchedImages, bool]:
     """Limit the inliers of pairs with a wrong pose from which the mapper might start.
 
@@ -93,7 +70,8 @@ def demote_bad_initial_pairs(
             matrix, which needs known focal lengths.
         cameras: the camera of each image.
         clock: gets the stage "verification".
-        known: known poses, if any.
+        known: for each model with known poses, float64 [3, 4] cam_from_world of each image, None if
+            it is not in the model. The relative pose of images in different models is not known.
 
     Returns:
         The images with fewer inliers, and whether a pair certainly meets the mapper's first limits.
@@ -114,7 +92,7 @@ def demote_bad_initial_pairs(
                 continue
             angle = _triangulation_angle(pose[:, :3], some.rays)
             flat_angle = _contradicted_angle(geometry, some)
-            rotation = known.rotation(pair)
+            rotation = _known_rotation(known, pair)
             if flat_angle is not None:
                 wrong[k] = flat_angle
             elif rotation is not None and _angle_between(pose[:, :3], rotation) > _WRONG * angle:
@@ -122,14 +100,14 @@ def demote_bad_initial_pairs(
             elif count >= _MARGIN * INITIAL_MIN_INLIERS:
                 is_aside = abs(pose[2, 3]) < INITIAL_MAX_FORWARD_MOTION
                 has_start |= is_aside and angle >= _MARGIN * INITIAL_MIN_ANGLE
-            if count < _MARGIN * INITIAL_MIN_INLIERS and abs(pair[1] - pair[0]) > _NEIGHBOURS:
+            if count < _MARGIN * INITIAL_MIN_INLIERS and abs(pair[1] - pair[0]) > NEIGHBOURS:
                 few.append(k)
         least = INITIAL_MIN_ANGLE if has_start else INITIAL_MIN_ANGLE / 2
         if matched.forward_motion:
             least = min(least, FORWARD_MOTION_OPTIONS["init_min_tri_angle"])
         geometries = list(matched.geometries)
         bad = {k for k, angle in wrong.items() if angle >= _WIDE_SHARE * least}
-        if known.models and not has_start:
+        if known and not has_start:
             bad.update(few)
         for k in bad:
             geometries[k] = demoted(geometries[k])
@@ -139,8 +117,21 @@ def demote_bad_initial_pairs(
 def demoted(geometry: TwoViewGeometry) -> TwoViewGeometry:
     """Keep some of the inliers, evenly spread, too few for an initial pair."""
     count = len(geometry.inlier_matches)
+    if count < _MIN_INLIERS:
+        return geometry
     chosen = evenly_spread(count, _MIN_INLIERS - 1, rounded=True)
     return replace(geometry, inlier_matches=geometry.inlier_matches[chosen])
+
+
+def _known_rotation(
+    models: Sequence[Sequence[_Floats | None]], pair: Sequence[int]
+) -> _Floats | None:
+    """The rotation from the first camera of a pair to the second; None if not known."""
+    for cam_from_world in models:
+        first, second = (cam_from_world[image] for image in pair)
+        if first is not None and second is not None:
+            return np.asarray(second[:, :3] @ first[:, :3].T)
+    return None
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,6 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
 
     database, output = Path(settings["database"]), Path(settings["model"])
     refine = settings["refine_intrinsics"]
-    common = {"random_seed": settings["seed"], "num_threads": settings["num_threads"]}
     pycolmap.set_random_seed(settings["seed"])
     each = output / "each"
     each.mkdir()
@@ -70,7 +69,9 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
         callbacks: Any = {"initial_image_pair_callback": placed, "next_image_callback": placed}
         models = pycolmap.incremental_mapping(database, each, each, options=how, **callbacks)
     else:
-        global_options = pycolmap.GlobalPipelineOptions(**common)
+        global_options = pycolmap.GlobalPipelineOptions(
+            random_seed=settings["seed"], num_threads=settings["num_threads"]
+        )
         adjustment = global_options.mapper.bundle_adjustment
         adjustment.refine_focal_length = refine
         adjustment.refine_extra_params = refine

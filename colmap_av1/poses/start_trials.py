@@ -18,8 +18,8 @@ import pycolmap
 
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import demoted
-from colmap_av1.matching.mapper_limits import INITIAL_MIN_INLIERS, LOWER_INITIAL_LIMITS
+from colmap_av1.matching.initial_pairs import NEIGHBOURS, demoted
+from colmap_av1.matching.mapper_limits import LOWER_INITIAL_LIMITS
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
 from colmap_av1.util.run_context import RunContext
@@ -31,8 +31,6 @@ _NUM_IMAGES = 10
 _LEAST_IMAGES = 3
 # Largest number of starts that are tried.
 _MAX_TRIALS = 5
-# Neighbours are at most this many images apart. They keep their inliers, which connect them.
-_NEIGHBOURS = 2
 
 
 def demote_failing_starts(
@@ -92,11 +90,9 @@ def demote_failing_starts(
             if failed is None:
                 return found
             is_in = np.isin(matched.pairs, [names.index(name) for name in failed]).all(axis=1)
-            is_in &= np.diff(matched.pairs, axis=1)[:, 0] > _NEIGHBOURS
+            is_in &= np.diff(matched.pairs, axis=1)[:, 0] > NEIGHBOURS
             geometries = [
-                demoted(geometry)
-                if demote and len(geometry.inlier_matches) >= INITIAL_MIN_INLIERS // 2
-                else geometry
+                demoted(geometry) if demote else geometry
                 for geometry, demote in zip(found.geometries, is_in.tolist(), strict=True)
             ]
             found = replace(found, geometries=geometries)

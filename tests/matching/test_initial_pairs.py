@@ -11,7 +11,7 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import KnownPoses, demote_bad_initial_pairs
+from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
 from colmap_av1.matching.mapper_limits import INITIAL_MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
@@ -134,9 +134,7 @@ def test_pair_with_a_wrong_pose_is_demoted(
     matched = MatchedImages(keypoints, PAIR, [matches], [geometry], forward_motion)
     wrong = Rotation.from_euler("y", turned + 20, degrees=True).as_matrix()
     poses = [np.eye(3, 4), np.hstack([wrong, [[0], [0], [1]]])]
-    found, meets_first_limits = demote_bad_initial_pairs(
-        matched, [CAMERA] * 2, Clock(), KnownPoses([poses])
-    )
+    found, meets_first_limits = demote_bad_initial_pairs(matched, [CAMERA] * 2, Clock(), [poses])
     count = len(found.geometries[0].inlier_matches)
     assert (count == len(geometry.inlier_matches)) == is_kept == meets_first_limits
     assert count >= 40
@@ -163,7 +161,7 @@ def test_wrong_pair_below_the_angle_of_a_good_pair_is_kept() -> None:
             False,
         )
         found, meets_first_limits = demote_bad_initial_pairs(
-            matched, [CAMERA] * 4, Clock(), KnownPoses([poses])
+            matched, [CAMERA] * 4, Clock(), [poses]
         )
         assert (found.geometries[-1] is geometries[1]) == is_kept == meets_first_limits
 
@@ -185,6 +183,6 @@ def test_pair_with_few_inliers_is_demoted_if_no_pair_has_a_large_angle() -> None
     matched = MatchedImages(
         keypoints, pairs, [g.inlier_matches for g in geometries], geometries, False
     )
-    found, _ = demote_bad_initial_pairs(matched, [CAMERA] * 10, Clock(), KnownPoses([poses]))
+    found, _ = demote_bad_initial_pairs(matched, [CAMERA] * 10, Clock(), [poses])
     kept = [a is b for a, b in zip(found.geometries, geometries, strict=True)]
     assert kept == [True, False, True]

@@ -12,6 +12,7 @@ from dense_scene import NUM_IMAGES, Truth
 from numpy.typing import NDArray
 from sequences import model_poses
 
+from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import MapOptions
@@ -30,8 +31,7 @@ def inliers_of(database: Path) -> Inliers:
         pair_ids, geometries = opened.read_two_view_geometries()
     found = {}
     for pair_id, geometry in zip(pair_ids, geometries, strict=True):
-        first, second = divmod(int(pair_id), 2147483647)
-        found[first, second] = geometry.inlier_matches
+        found[image_ids_from_pair_id(int(pair_id))] = geometry.inlier_matches
     return found
 
 
