@@ -155,16 +155,17 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
         if posed.adjustment is None:
             break
         adjusted = posed.adjustment.result
-        seams = adjusted.thin_seams
+        seams: Sequence[tuple[str, str]] = adjusted.thin_seams
         if posed.far_views is not None and posed.far_views.result.apart:
             seams = adjusted.doubtful_seams
-        if not (seams or adjusted.turns):
+        seams = sorted({*seams, *adjusted.turns})
+        if not seams:
             break
         parts = split_stage(run, image_set, posed.mapped, posed.adjustment, seams, number=number)
         if parts.result.num_registered == adjusted.num_registered:
             break
         frame_of = image_set.images.frame_of
-        frames = [frame_of[first] for first, _ in {*seams, *adjusted.turns}]
+        frames = [frame_of[first] for first, _ in seams]
         posed = replace(
             posed,
             mapped=parts,

@@ -6,7 +6,7 @@ A seam lies between two images that are neighbours in time.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -25,7 +25,7 @@ _DOUBTFUL = 0.15
 _WEAK = 0.07
 # A point connects two images that are at most this many images apart. Otherwise a place that is
 # seen again would connect all seams in between.
-REACH = 10
+_REACH = 10
 # A seam with this many points is never weak, however many others have: bent models had at most 50.
 _ENOUGH = 100
 # A seam is not weak if images before and after it share at least this share of the median number
@@ -162,7 +162,7 @@ def model_seams(reconstruction: pycolmap.Reconstruction) -> Seams:
     num_images, num_seams = len(images), max(len(images) - 1, 0)
     order = np.lexsort((views, point))
     views, point = views[order], point[order]
-    near = np.flatnonzero((np.diff(point) == 0) & (np.diff(views) <= REACH))
+    near = np.flatnonzero((np.diff(point) == 0) & (np.diff(views) <= _REACH))
     first, last = (np.full(len(xyz), fill) for fill in (num_images, -1))
     np.minimum.at(first, point, views)
     np.maximum.at(last, point, views)
@@ -176,11 +176,10 @@ def model_seams(reconstruction: pycolmap.Reconstruction) -> Seams:
     # The first view of a visit with enough parallax to its first one, and the last view with enough
     # parallax to its last one.
     deep_from, deep_to = (np.full(len(begin), fill) for fill in (num_images, -1))
-    focal = [reconstruction.cameras[image.camera_id].mean_focal_length() for image in images]
-    least_angle = np.degrees(_LEAST_PARALLAX / np.median(focal)) if focal else 0.0
+    least_angle = least_depth_angle(reconstruction.cameras[image.camera_id] for image in images)
     centres = camera_centres(np.array([image.cam_from_world for image in images]).reshape(-1, 3, 4))
-    from_first = _angle(centres[views], centres[begin[visit]], xyz[point]) >= least_angle
-    from_last = _angle(centres[views], centres[end[visit]], xyz[point]) >= least_angle
+    from_first = ray_angle(centres[views], centres[begin[visit]], xyz[point]) >= least_angle
+    from_last = ray_angle(centres[views], centres[end[visit]], xyz[point]) >= least_angle
     np.minimum.at(deep_from, visit[from_first], views[from_first])
     np.maximum.at(deep_to, visit[from_last], views[from_last])
 
@@ -237,7 +236,17 @@ def _seen_points(
     return np.array(views, np.int64), number, np.array(xyz, np.float64).reshape(-1, 3)
 
 
-def _angle(
+def least_depth_angle(cameras: Iterable[pycolmap.Camera]) -> float:
+    """Smallest angle in degrees between the rays to a point that give it depth.
+
+    Args:
+        cameras: the camera of each image.
+    """
+    focal = [camera.mean_focal_length() for camera in cameras]
+    return float(np.degrees(_LEAST_PARALLAX / np.median(focal))) if focal else 0.0
+
+
+def ray_angle(
     a: NDArray[np.float64], b: NDArray[np.float64], point: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Angle in degrees between the rays from two positions [n, 3] to each point [n, 3]."""

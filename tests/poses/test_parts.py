@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import pycolmap
 import pytest
 import walks
 from image_sets import images
@@ -19,18 +20,26 @@ from colmap_av1.reconstruct import reconstruct
 
 
 def model(image_set: ImageSet, views: list[list[int]]) -> PosedModel:
-    """A model of all images, with a point for each list of images that see it."""
+    """A model of all images, with a point for each list of images that see it.
+
+    The camera moves sideways past the points, so two views give a point depth.
+    """
     count = len(views)
     points = ModelPoints(
-        xyz=np.zeros((count, 3)),
+        xyz=np.tile([0.0, 0.0, 50.0], (count, 1)),
         rgb=np.zeros((count, 3), np.uint8),
         error=np.zeros(count),
         offsets=np.concatenate([[0], np.cumsum([len(own) for own in views])]).astype(np.int64),
         image=np.concatenate(views).astype(np.int64),
         xy=np.zeros((sum(map(len, views)), 2)),
     )
-    posed = [ModelImage(i + 1, n, 1, np.eye(3, 4)) for i, n in enumerate(image_set.images.names)]
-    return PosedModel({}, posed, points)
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500, 640, 480)
+    posed = []
+    for number, name in enumerate(image_set.images.names):
+        pose = np.eye(3, 4)
+        pose[0, 3] = -number
+        posed.append(ModelImage(number + 1, name, 1, pose))
+    return PosedModel({1: camera}, posed, points)
 
 
 def names(image_set: ImageSet, *index: int) -> set[str]:
@@ -41,28 +50,46 @@ def seam(image_set: ImageSet, before: int) -> tuple[str, str]:
     return image_set.images.names[before], image_set.images.names[before + 1]
 
 
+def stretch(image_set: ImageSet, *index: int) -> list[list[int]]:
+    """Points that give a stretch of images depth."""
+    assert max(index) < len(image_set.sequence)
+    return [list(index)] * 200
+
+
 def test_model_is_split_at_a_seam_with_few_points() -> None:
     image_set = images(30)
-    known = model(image_set, [[12, 13]] * 50)
-    first, second = parts_of(known, image_set, [seam(image_set, 12)])
+    own = [*stretch(image_set, 0, 12), *stretch(image_set, 13, 29)]
+    few = model(image_set, [*own, *[[11, 12, 13, 14]] * 10])
+    first, second = parts_of(few, image_set, [seam(image_set, 12)])
     assert (first, second) == (names(image_set, *range(13, 30)), names(image_set, *range(13)))
-    known = model(image_set, [[11, 12, 13]] * 200)
-    assert len(parts_of(known, image_set, [seam(image_set, 12)])) == 1
+    many = model(image_set, [*own, *[[11, 12, 13, 14]] * 200])
+    assert len(parts_of(many, image_set, [seam(image_set, 12)])) == 1
 
 
-def test_points_seen_during_a_turn_do_not_join_parts() -> None:
+def test_points_without_parallax_on_either_side_do_not_join_parts() -> None:
     image_set = images(30)
-    known = model(image_set, [[12, 13]] * 1000)
-    assert len(parts_of(known, image_set, [], [seam(image_set, 12)])) == 2
-    known = model(image_set, [[12, 13]] * 1000 + [[0, 1, 28, 29]] * 200)
-    assert len(parts_of(known, image_set, [], [seam(image_set, 12)])) == 1
+    own = [*stretch(image_set, 0, 12), *stretch(image_set, 13, 29)]
+    for views in ([12, 13], [11, 12, 13], [0, 29]):
+        known = model(image_set, [*own, *[views] * 1000])
+        assert len(parts_of(known, image_set, [seam(image_set, 12)])) == 2
+
+
+def test_a_stretch_without_parallax_joins_no_parts() -> None:
+    image_set = images(36)
+    seams = [seam(image_set, 14), seam(image_set, 15)]
+    own = [*stretch(image_set, 0, 14), *stretch(image_set, 16, 35)]
+    known = model(image_set, [*own, *[[0, 15]] * 200, *[[15, 35]] * 200])
+    first, second = parts_of(known, image_set, seams)
+    assert (first, second) == (names(image_set, *range(16, 36)), names(image_set, *range(15)))
 
 
 def test_a_revisited_place_joins_parts() -> None:
     image_set = images(36)
     seams = [seam(image_set, 11), seam(image_set, 23)]
-    assert len(parts_of(model(image_set, [[0, 35]] * 50), image_set, seams)) == 3
-    first, second = parts_of(model(image_set, [[0, 35]] * 200), image_set, seams)
+    own = [*stretch(image_set, 0, 11), *stretch(image_set, 12, 23), *stretch(image_set, 24, 35)]
+    assert len(parts_of(model(image_set, [*own, *[[0, 5, 30, 35]] * 10]), image_set, seams)) == 3
+    known = model(image_set, [*own, *[[0, 5, 30, 35]] * 200])
+    first, second = parts_of(known, image_set, seams)
     assert first == names(image_set, *range(12), *range(24, 36))
     assert second == names(image_set, *range(12, 24))
 
@@ -70,7 +97,7 @@ def test_a_revisited_place_joins_parts() -> None:
 def test_another_video_joins_parts() -> None:
     image_set = images(24, 12)
     seams = [seam(image_set, 11)]
-    apart = [[0, 1, 24]] * 100
+    apart = [*stretch(image_set, 0, 1, 24), *stretch(image_set, 12, 23)]
     assert len(parts_of(model(image_set, apart), image_set, seams)) == 2
     assert len(parts_of(model(image_set, [*apart, *[[23, 30]] * 30]), image_set, seams)) == 1
 
