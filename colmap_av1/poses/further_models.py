@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
+import pycolmap
 
 from colmap_av1.errors import ModelError, cannot_write
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
@@ -70,6 +73,7 @@ def further_poses(
         map_again: map the models again from their observations, see `remapping`.
     """
     left = set(image_set.images.names) - _registered(run, first)
+    cameras = read_posed_model(run.stages / first.last.result.poses).cameras
     waiting = _other_models(run, first)
     number = 1
     while waiting:
@@ -78,7 +82,9 @@ def further_poses(
         if len(known & left) < LEAST_IMAGES:  # nearly all of its images are in an earlier model
             continue
         own = _run_of_model(run, number)
-        own_poses = _poses_of_model(run, own, first, mapped)
+        own_poses = _poses_of_model(own, first, mapped, cameras)
+        if all(image.camera_id in cameras for image in mapped.model.images):
+            own = _with_known_intrinsics(own)
         free = left.difference(*(other.model.by_name for other in waiting))
         some = _named(image_set, known | free)
         try:
@@ -151,21 +157,25 @@ def _run_of_model(run: Run, number: int) -> Run:
     return own
 
 
-def _poses_of_model(run: Run, own: Run, first: Posed, mapped: _MappedModel) -> Kept[MappedResult]:
+def _with_known_intrinsics(run: Run) -> Run:
+    """The run, without refinement of intrinsics."""
+    mapping = replace(run.options.mapping, refine_intrinsics=False)
+    return replace(run, options=replace(run.options, mapping=mapping))
+
+
+def _poses_of_model(
+    own: Run, first: Posed, mapped: _MappedModel, known: Mapping[int, pycolmap.Camera]
+) -> Kept[MappedResult]:
     """Write the poses of a further model to its stages.
 
-    A few images do not determine a camera well, so the cameras of the first model are used where it
-    has them.
-
     Args:
-        run: the run of the first model.
         own: the run of the further model, see `_run_of_model`.
         first: the first model.
         mapped: the further model.
+        known: cameras of the first model by id, which replace those of the further model.
     """
 
     def make(partial: Path) -> MappedResult:
-        known = read_posed_model(run.stages / first.last.result.poses).cameras
         model = mapped.model
         cameras = {i: known.get(i, camera) for i, camera in model.cameras.items()}
         write_posed_model(partial / "mapped.npz", PosedModel(cameras, model.images))
