@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import count
 from pathlib import Path
+from typing import Any, TypeVar
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.corners.in_images import corners_in_images
 from colmap_av1.poses.dynamic.following import follow_behind, has_changing_masks
@@ -26,8 +28,11 @@ from colmap_av1.poses.pose_stages import (
     AdjustedResult,
     MappedResult,
     adjustment_stage,
+    mapper_models,
+    num_nearest,
     pose_stage,
     resection_stage,
+    with_model_first,
 )
 from colmap_av1.poses.posed_images import PosesResult
 from colmap_av1.poses.remapping import remap_stage
@@ -35,6 +40,8 @@ from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
+
+_Decision = TypeVar("_Decision")
 
 # Number of the adjustment after the first split; 1 and 2 follow the first and second mapping.
 _FIRST_SPLIT = 3
@@ -92,6 +99,17 @@ class Posed:
 
 
 @dataclass(frozen=True)
+class _FirstModel:
+    """Which model of the mapper becomes the first.
+
+    Attributes:
+        file: the file of the model; None for the one that is the largest before it is split.
+    """
+
+    file: str | None
+
+
+@dataclass(frozen=True)
 class _ToMend:
     """Signs that the first poses are wrong.
 
@@ -109,39 +127,67 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
     """Estimate poses, and if they are doubtful estimate them again with SIFT links.
 
     Links replace motion at doubtful seams. Loop closures are looked for if pictures far apart in
-    time contradict the poses. A model that is still poorly connected is split, see `parts`.
+    time contradict the poses. A model that is still poorly connected is split, see `parts`. If
+    another model of the mapper is then larger than the largest part, it becomes the first.
     """
-    first: list[Posed] = []
+    options = run.options
+    key = [
+        [own.digest for own in videos],
+        image_set.videos,
+        run.photo_digests,
+        options.match,
+        options.mapping,
+    ]
 
-    def make(_: Path) -> _ToMend:
-        posed = _pose_stages(run, videos, image_set, doubted=())
-        first.append(posed)
+    def run_with_links(found: _ToMend) -> Run:
+        return _with_all_links(run) if found.apart else run
+
+    @lru_cache(maxsize=1)
+    def posed(found: _ToMend, first: str | None) -> Posed:
+        own = run_with_links(found)
+        return _pose_stages(own, videos, image_set, doubted=found.doubted, first=first)
+
+    @lru_cache(maxsize=1)
+    def split(found: _ToMend, first: str | None) -> Posed:
+        return split_at_seams(run_with_links(found), posed(found, first), image_set)
+
+    def look_for_errors(_: Path) -> _ToMend:
+        once = posed(_ToMend(doubted=(), apart=False), None)
         return _ToMend(
-            doubted=tuple(_unlinked_seams(run, image_set, posed)),
-            apart=_are_unlinked_and_apart(run, posed),
+            doubted=tuple(_unlinked_seams(run, image_set, once)),
+            apart=_are_unlinked_and_apart(run, once),
         )
 
-    options = run.options
-    found = run_stage(
-        run.stages,
-        "seams",
-        [
-            [own.digest for own in videos],
-            image_set.videos,
-            run.photo_digests,
-            options.match,
-            options.mapping,
-        ],
-        _ToMend,
-        into=run.stages,
-        products=[],
-        make=make,
-    ).result
-    if first and not found.doubted and not found.apart:
-        return split_at_seams(run, first[0], image_set)
-    again = _with_all_links(run) if found.apart else run
-    posed = _pose_stages(again, videos, image_set, doubted=found.doubted)
-    return split_at_seams(again, posed, image_set)
+    def compare_models(_: Path) -> _FirstModel:
+        return _FirstModel(_larger_model(run, split(found, None), image_set))
+
+    found = _decided(run, "seams", key, _ToMend, look_for_errors)
+    first = _decided(run, "first", [key, found], _FirstModel, compare_models).file
+    return split(found, first)
+
+
+def _decided(
+    run: Run,
+    name: str,
+    key: Sequence[Any],
+    kind: type[_Decision],
+    make: Callable[[Path], _Decision],
+) -> _Decision:
+    """The result of a stage without products."""
+    return run_stage(run.stages, name, key, kind, into=run.stages, products=[], make=make).result
+
+
+def _larger_model(run: Run, posed: Posed, image_set: ImageSet) -> str | None:
+    """The file of the mapper's largest other model, if that is larger than the first model."""
+    keyed = image_set.some(posed.matches.result.key_images)
+    size = {
+        file: num_nearest(read_posed_model(run.stages / file), image_set, keyed)
+        for file in mapper_models(posed.mapped)
+    }
+    largest = max(size, key=lambda file: size[file], default=None)
+    if largest is None or size[largest] <= posed.last.result.num_registered:
+        return None
+    return largest
 
 
 def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
@@ -216,14 +262,25 @@ def _pose_stages(
     image_set: ImageSet,
     *,
     doubted: Sequence[int],
+    first: str | None = None,
 ) -> Posed:
-    """Match, map, resect and adjust; `doubted` as in `match_stage`."""
+    """Match, map, resect and adjust.
+
+    Args:
+        run: the run.
+        videos: the tracks of each video.
+        image_set: the images.
+        doubted: see `match_stage`.
+        first: file of the mapper's model to continue with; None for the largest.
+    """
     matched = match_stage(run, videos, image_set, doubted)
     depth = matched.result.depth
     if not depth.is_observable:
         raise ModelError(f"{run.inputs.name}: {depth.warning}")
     keyed = image_set.some(matched.result.key_images)
     mapped = pose_stage(run, matched, image_set, keyed)
+    if first is not None:
+        mapped = with_model_first(run, mapped, keyed, first)
     # Without a read-out time the tracks were not corrected.
     has_picture_positions = not any(own.read_out for own in videos)
     trusted = trusted_tracks(run, [own.tracks for own in videos], image_set)

@@ -23,6 +23,7 @@ from colmap_av1.geometry.colmap_model import (
 from colmap_av1.geometry.posed_model import (
     PosedModel,
     posed_model,
+    read_posed_model,
     write_posed_model,
 )
 from colmap_av1.geometry.resection import interpolate_poses, resect, sightings_of
@@ -53,9 +54,12 @@ from colmap_av1.poses.track_stage import LEAST_IMAGES, pose_tracks
 from colmap_av1.poses.zoom import with_own_cameras
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.digests import digest_of
 from colmap_av1.util.progress import progress_in
 from colmap_av1.util.stages import Kept, run_stage
 
+# Folder of the models of the mapper.
+_MODELS = "poses"
 # With fewer tracks per image than this, a failed initialization is blamed on the tracks.
 _FEW_TRACKS = 100
 # The selection of tracks for bundle adjustment.
@@ -183,8 +187,8 @@ def pose_stage(
         if not found:
             raise ModelError(_why_no_initial_pair(found_before, attempt.mapper))
         found = _largest_first(found, image_set, keyed)
-        (partial / "poses").mkdir()
-        files = [f"poses/{number}.npz" for number in range(len(found))]
+        (partial / _MODELS).mkdir()
+        files = [f"{_MODELS}/{number}.npz" for number in range(len(found))]
         for file, model in zip(files, found, strict=True):
             write_posed_model(partial / file, model)
         return MappedResult(
@@ -201,7 +205,7 @@ def pose_stage(
         [matched.digest, attempts, START_TRACKS, mapping.adjust, ends_early, pycolmap.__version__],
         MappedResult,
         into=run.stages,
-        products=["poses"],
+        products=[_MODELS],
         make=make,
     )
 
@@ -210,20 +214,50 @@ def _largest_first(
     models: list[PosedModel], image_set: ImageSet, keyed: ImageSet
 ) -> list[PosedModel]:
     """Sort models by the number of images that are nearest to their key images."""
-    if len(models) < 2:
-        return models
+    size = [num_nearest(model, image_set, keyed) for model in models]
+    return [models[k] for k in sorted(range(len(models)), key=lambda k: -size[k])]
+
+
+def num_nearest(model: PosedModel, image_set: ImageSet, keyed: ImageSet) -> int:
+    """The number of images that are nearest to the key images of a model.
+
+    Args:
+        model: a model of key images.
+        image_set: all images.
+        keyed: all key images.
+    """
     key = keyed.images.frames
     nearest = np.searchsorted((key[1:] + key[:-1]) / 2, image_set.images.frames)
-    num_nearest = np.bincount(nearest, minlength=len(key))
-    size = [
-        sum(
-            int(count)
-            for name, count in zip(keyed.images.names, num_nearest, strict=True)
-            if name in images
-        )
-        for images in (model.by_name for model in models)
-    ]
-    return [models[k] for k in sorted(range(len(models)), key=lambda k: -size[k])]
+    is_in_model = np.isin(keyed.images.names, list(model.by_name))
+    return int(np.count_nonzero(is_in_model[nearest]))
+
+
+def mapper_models(mapped: Kept[MappedResult]) -> list[str]:
+    """Files of the mapper's own models among the other models, see `pose_stage`."""
+    return [file for file in mapped.result.other_models if file.startswith(_MODELS)]
+
+
+def with_model_first(
+    run: Run, mapped: Kept[MappedResult], keyed: ImageSet, file: str
+) -> Kept[MappedResult]:
+    """The models of the mapper, with another one as the first.
+
+    Args:
+        run: the run.
+        mapped: the models, see `pose_stage`.
+        keyed: the key images.
+        file: the file of the new first model, see `mapper_models`.
+    """
+    placed = read_posed_model(run.stages / file).by_name
+    others = [own for own in (mapped.result.poses, *mapped.result.other_models) if own != file]
+    result = replace(
+        mapped.result,
+        poses=file,
+        num_registered=len(placed),
+        registered=registered_by_video(placed, keyed),
+        other_models=tuple(others),
+    )
+    return replace(mapped, result=result, digest=digest_of([mapped.digest, file]))
 
 
 def _why_no_initial_pair(found: MatchesResult, mapper: str) -> str:
