@@ -315,32 +315,30 @@ def phone_to_folder(rows: list[Row]) -> str:
 
 
 def summary(rows: list[Row], *clips: str) -> str:
-    """A row for each clip: `match` and `reconstruct`, with SIFT's figures in parentheses.
+    """A row for each clip with the figures of SIFT, `match` and `reconstruct`.
 
     Errors of camera centres are relative to true poses.
     """
     whole = {(row["clip"], row["way"]): row for row in rows}
 
-    def both(heading: str, way: str, name: str, spelling: str) -> Column:
+    def each(heading: str, name: str, spelling: str) -> Column:
         def cell(line: Row) -> str:
-            ours, sift = whole[line["clip"], way], whole[line["clip"], SIFT_FROM_FILE]
-            if not ours[name]:
-                return "-"
-            return f"**{number(ours, name, spelling)}** ({number(sift, name, spelling)})"
+            figures = [
+                number(whole[line["clip"], way], name, spelling)
+                for way in (SIFT_FROM_FILE, MATCH_PYCOLMAP, FROM_FILE)
+            ]
+            return " / ".join(figures) if whole[line["clip"], FROM_FILE][name] else "-"
 
         return Column(heading, cell)
 
     columns = [
         Column(
-            "clip, images",
-            lambda row: f"`{row['clip']}`, {whole[row['clip'], FROM_FILE]['images']}",
+            "clip",
+            lambda row: f"`{row['clip']}`, {whole[row['clip'], FROM_FILE]['images']} images",
         ),
-        both("`match` and COLMAP's mapper: CPU s", MATCH_PYCOLMAP, "cpu_s", ".0f"),
-        both("points", MATCH_PYCOLMAP, "points", ",.0f"),
-        both("error of centres", MATCH_PYCOLMAP, "ate_of_extent", ".2%"),
-        both("`reconstruct`: CPU s", FROM_FILE, "cpu_s", ".0f"),
-        both("points", FROM_FILE, "points", ",.0f"),
-        both("error of centres", FROM_FILE, "ate_of_extent", ".2%"),
+        each("CPU time in s", "cpu_s", ".0f"),
+        each("3D points", "points", ",.0f"),
+        each("error of camera centres", "ate_of_extent", ".2%"),
     ]
     return markdown(columns, [{"clip": clip} for clip in clips])
 
