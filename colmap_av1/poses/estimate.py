@@ -9,6 +9,9 @@ from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
+import pycolmap
+
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.posed_model import read_posed_model
@@ -28,7 +31,6 @@ from colmap_av1.poses.pose_stages import (
     AdjustedResult,
     MappedResult,
     adjustment_stage,
-    mapper_models,
     num_nearest,
     pose_stage,
     resection_stage,
@@ -99,11 +101,26 @@ class Posed:
 
 
 @dataclass(frozen=True)
-class _FirstModel:
-    """Which model of the mapper becomes the first.
+class _Mapped:
+    """The matched images and the mapper's models of them.
 
     Attributes:
-        file: the file of the model; None for the one that is the largest before it is split.
+        matched: the database of the key images.
+        keyed: the key images.
+        mapped: the mapper's models.
+    """
+
+    matched: Kept[MatchesResult]
+    keyed: ImageSet
+    mapped: Kept[MappedResult]
+
+
+@dataclass(frozen=True)
+class _FirstModel:
+    """Which of the mapper's models becomes the first.
+
+    Attributes:
+        file: the file of the model; None for the largest before models are split.
     """
 
     file: str | None
@@ -128,7 +145,7 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
 
     Links replace motion at doubtful seams. Loop closures are looked for if pictures far apart in
     time contradict the poses. A model that is still poorly connected is split, see `parts`. If
-    another model of the mapper is then larger than the largest part, it becomes the first.
+    another of the mapper's models is larger than the largest part, it becomes the first.
     """
     options = run.options
     key = [
@@ -137,32 +154,53 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         run.photo_digests,
         options.match,
         options.mapping,
+        options.moving,
+        pycolmap.__version__,
     ]
 
     def run_with_links(found: _ToMend) -> Run:
         return _with_all_links(run) if found.apart else run
 
     @lru_cache(maxsize=1)
-    def posed(found: _ToMend, first: str | None) -> Posed:
-        own = run_with_links(found)
-        return _pose_stages(own, videos, image_set, doubted=found.doubted, first=first)
+    def map_key_images(found: _ToMend) -> _Mapped:
+        return _map_key_images(run_with_links(found), videos, image_set, doubted=found.doubted)
+
+    @lru_cache(maxsize=1)
+    def pose(found: _ToMend, first: str | None) -> Posed:
+        return _pose_images(run_with_links(found), videos, image_set, map_key_images(found), first)
 
     @lru_cache(maxsize=1)
     def split(found: _ToMend, first: str | None) -> Posed:
-        return split_at_seams(run_with_links(found), posed(found, first), image_set)
+        return split_at_seams(run_with_links(found), pose(found, first), image_set)
 
     def look_for_errors(_: Path) -> _ToMend:
-        once = posed(_ToMend(doubted=(), apart=False), None)
+        once = pose(_ToMend(doubted=(), apart=False), None)
         return _ToMend(
             doubted=tuple(_unlinked_seams(run, image_set, once)),
             apart=_are_unlinked_and_apart(run, once),
         )
 
     def compare_models(_: Path) -> _FirstModel:
-        return _FirstModel(_larger_model(run, split(found, None), image_set))
+        largest_part = split(found, None)
+        size = largest_part.last.result.num_registered
+        if largest_part is pose(found, None):  # it was not split
+            return _FirstModel(None)
+        other = _larger_model(run, map_key_images(found), size, image_set)
+        if other is None:
+            return _FirstModel(None)
+        del largest_part
+        pose.cache_clear()
+        split.cache_clear()
+        try:
+            posed = split(found, other)
+        except ModelError:  # too few tracks agree with its poses
+            return _FirstModel(None)
+        is_apart = posed.far_views is not None and posed.far_views.result.apart
+        is_larger = posed.last.result.num_registered > size
+        return _FirstModel(other if is_larger and not is_apart else None)
 
     found = _decided(run, "seams", key, _ToMend, look_for_errors)
-    first = _decided(run, "first", [key, found], _FirstModel, compare_models).file
+    first = _decided(run, "first_model", [key, found], _FirstModel, compare_models).file
     return split(found, first)
 
 
@@ -177,17 +215,12 @@ def _decided(
     return run_stage(run.stages, name, key, kind, into=run.stages, products=[], make=make).result
 
 
-def _larger_model(run: Run, posed: Posed, image_set: ImageSet) -> str | None:
-    """The file of the mapper's largest other model, if that is larger than the first model."""
-    keyed = image_set.some(posed.matches.result.key_images)
-    size = {
-        file: num_nearest(read_posed_model(run.stages / file), image_set, keyed)
-        for file in mapper_models(posed.mapped)
-    }
-    largest = max(size, key=lambda file: size[file], default=None)
-    if largest is None or size[largest] <= posed.last.result.num_registered:
-        return None
-    return largest
+def _larger_model(run: Run, mapped: _Mapped, size: int, image_set: ImageSet) -> str | None:
+    """The file of the mapper's second model; None if it has no more than `size` images."""
+    for file in mapped.mapped.result.other_models[:1]:  # they are sorted by size
+        if num_nearest(read_posed_model(run.stages / file), image_set, mapped.keyed) > size:
+            return file
+    return None
 
 
 def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
@@ -256,41 +289,47 @@ def _unlinked_seams(run: Run, image_set: ImageSet, posed: Posed) -> list[int]:
     ]
 
 
-def _pose_stages(
-    run: Run,
-    videos: Sequence[VideoTracks],
-    image_set: ImageSet,
-    *,
-    doubted: Sequence[int],
-    first: str | None = None,
-) -> Posed:
-    """Match, map, resect and adjust.
-
-    Args:
-        run: the run.
-        videos: the tracks of each video.
-        image_set: the images.
-        doubted: see `match_stage`.
-        first: file of the mapper's model to continue with; None for the largest.
-    """
+def _map_key_images(
+    run: Run, videos: Sequence[VideoTracks], image_set: ImageSet, *, doubted: Sequence[int]
+) -> _Mapped:
+    """Match and map the key images; `doubted` as in `match_stage`."""
     matched = match_stage(run, videos, image_set, doubted)
     depth = matched.result.depth
     if not depth.is_observable:
         raise ModelError(f"{run.inputs.name}: {depth.warning}")
     keyed = image_set.some(matched.result.key_images)
-    mapped = pose_stage(run, matched, image_set, keyed)
+    return _Mapped(matched, keyed, pose_stage(run, matched, image_set, keyed))
+
+
+def _pose_images(
+    run: Run,
+    videos: Sequence[VideoTracks],
+    image_set: ImageSet,
+    found: _Mapped,
+    first: str | None,
+) -> Posed:
+    """Resect and adjust.
+
+    Args:
+        run: the run.
+        videos: the tracks of each video.
+        image_set: the images.
+        found: the mapper's models.
+        first: file of the one to continue with; None for the largest.
+    """
+    mapped = found.mapped
     if first is not None:
-        mapped = with_model_first(run, mapped, keyed, first)
+        mapped = with_model_first(run, mapped, found.keyed, first)
     # Without a read-out time the tracks were not corrected.
     has_picture_positions = not any(own.read_out for own in videos)
     trusted = trusted_tracks(run, [own.tracks for own in videos], image_set)
     posed = refined_poses(
         run,
-        matched,
+        found.matched,
         mapped,
         trusted=trusted,
         image_set=image_set,
-        keyed=keyed,
+        keyed=found.keyed,
         has_picture_positions=has_picture_positions,
     )
     if _is_doubtful(posed):

@@ -3,8 +3,8 @@
 If hardly any points connect the two sides of a seam, bundle adjustment leaves their relative pose
 undetermined; if no points carry the scale across, it leaves their relative scale undetermined.
 Such a model is bent, although each side is correct. The sides become separate models, as with
-COLMAP's mapper where it cannot connect images, unless both see the same places with parallax, which
-determines their relative scale.
+COLMAP's mapper where it cannot connect images. They stay together if both see the same places with
+parallax, which determines their relative scale.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ FEWEST_IMAGES = 10
 # Stretches of different videos are connected by at least this many common points, the number of
 # inliers that COLMAP's mapper requires of a pair of images.
 _BETWEEN_VIDEOS = 15
-# Stretches of one video are connected by at least this many common points that have depth by the
-# views of either stretch alone. On 13 rendered walks the scales of two straight stretches with so
-# many differed by 5 % at most. Those of stretches with no such point differed by up to a factor of
-# 2.7, although they had 100 to 340 points in common.
+# Stretches of one video are connected by at least this many common points that have depth in each
+# of the two stretches by itself. On 13 rendered walks, the scales of straight stretches with at
+# least so many differed by 5 % at most. Those of stretches with no such point differed by up to a
+# factor of 2.7, although they had 100 to 340 points in common.
 _WITHIN_VIDEO = 20
 
 
@@ -48,7 +48,7 @@ def split_stage(
     *,
     number: int,
 ) -> Kept[MappedResult]:
-    """Split an adjusted model at its weak seams.
+    """Split an adjusted model at its seams.
 
     Args:
         run: the run.
@@ -83,14 +83,7 @@ def split_stage(
     return run_stage(
         run.stages,
         name,
-        [
-            mapped.digest,
-            adjusted.digest,
-            list(seams),
-            _BETWEEN_VIDEOS,
-            _WITHIN_VIDEO,
-            FEWEST_IMAGES,
-        ],
+        [mapped.digest, adjusted.digest, list(seams)],
         MappedResult,
         into=run.stages,
         products=[name],
@@ -104,8 +97,8 @@ def parts_of(
     """The names of the images of each part of a model, the largest part first.
 
     The images between two seams of a video form a stretch. Stretches belong to the same part if
-    they have enough common points that have depth by the views of either stretch alone: these
-    determine their relative scale. Parts of fewer than ten images are dropped, except the largest.
+    they have enough common points that have depth in each of them by itself: these determine their
+    relative scale. Parts of fewer than ten images are dropped, except the largest.
 
     Args:
         model: the model with its points.
@@ -143,8 +136,8 @@ def _seen_in_stretches(
         of_image: int64 [num_images] stretch of each image.
 
     Returns:
-        Index of the point and of the stretch, each int64 [n], and whether the point has depth by
-        the views of the stretch alone, bool [n].
+        Index of the point and of the stretch, each int64 [n], and whether the point has depth in
+        the stretch by itself, bool [n].
     """
     points = model.points
     point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
@@ -164,7 +157,7 @@ def _seen_in_stretches(
 def _common(
     point: NDArray[np.int64], stretch: NDArray[np.int64], shape: tuple[int, int]
 ) -> NDArray[np.int64]:
-    """The number of points that each two stretches have in common.
+    """The number of points that every two stretches have in common.
 
     Args:
         point: int64 [n] a point.

@@ -213,13 +213,12 @@ def pose_stage(
 def _largest_first(
     models: list[PosedModel], image_set: ImageSet, keyed: ImageSet
 ) -> list[PosedModel]:
-    """Sort models by the number of images that are nearest to their key images."""
-    size = [num_nearest(model, image_set, keyed) for model in models]
-    return [models[k] for k in sorted(range(len(models)), key=lambda k: -size[k])]
+    """Sort models by the number of images whose nearest key image they have."""
+    return sorted(models, key=lambda model: -num_nearest(model, image_set, keyed))
 
 
 def num_nearest(model: PosedModel, image_set: ImageSet, keyed: ImageSet) -> int:
-    """The number of images that are nearest to the key images of a model.
+    """The number of images whose nearest key image is in a model.
 
     Args:
         model: a model of key images.
@@ -232,11 +231,6 @@ def num_nearest(model: PosedModel, image_set: ImageSet, keyed: ImageSet) -> int:
     return int(np.count_nonzero(is_in_model[nearest]))
 
 
-def mapper_models(mapped: Kept[MappedResult]) -> list[str]:
-    """Files of the mapper's own models among the other models, see `pose_stage`."""
-    return [file for file in mapped.result.other_models if file.startswith(_MODELS)]
-
-
 def with_model_first(
     run: Run, mapped: Kept[MappedResult], keyed: ImageSet, file: str
 ) -> Kept[MappedResult]:
@@ -246,7 +240,7 @@ def with_model_first(
         run: the run.
         mapped: the models, see `pose_stage`.
         keyed: the key images.
-        file: the file of the new first model, see `mapper_models`.
+        file: the file of the new first model.
     """
     placed = read_posed_model(run.stages / file).by_name
     others = [own for own in (mapped.result.poses, *mapped.result.other_models) if own != file]

@@ -237,7 +237,7 @@ def _seen_points(
 
 
 def least_depth_angle(cameras: Iterable[pycolmap.Camera]) -> float:
-    """Smallest angle in degrees between the rays to a point that give it depth.
+    """Smallest angle in degrees between two rays at which their point has depth.
 
     Args:
         cameras: the camera of each image.

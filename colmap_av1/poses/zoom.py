@@ -50,7 +50,10 @@ def with_own_cameras(run: Run, model: PosedModel) -> Adjusted:
         shared = model.cameras
     elif single_camera is None and refines:
         shared = _zooming_cameras(run, model)
-    own = _with_copies(model, shared, 1)
+    existing = run.cameras.of_images if run.cameras is not None else []
+    num_cameras = len(run.inputs.videos) + len(run.inputs.photos)
+    last = max(num_cameras, *model.cameras, *(camera.camera_id for camera in existing))
+    own = _with_copies(model, shared, 1, last)
     if own.cameras.keys() == model.cameras.keys() or not refines:
         return Adjusted(own, np.arange(len(own.points.xyz)))
     for number in own.cameras.keys() - model.cameras.keys():
@@ -64,7 +67,7 @@ def with_own_cameras(run: Run, model: PosedModel) -> Adjusted:
 
 def _zooming_cameras(run: Run, model: PosedModel) -> set[int]:
     """Ids of the cameras whose focal length varies between images."""
-    trial = _with_copies(model, model.cameras, _GROUP)
+    trial = _with_copies(model, model.cameras, _GROUP, max(model.cameras))
     if trial.cameras.keys() == model.cameras.keys():
         return set()
     scale = LOSS_SCALES[-1]
@@ -98,7 +101,9 @@ def _mean_cost(model: PosedModel, is_own: NDArray[np.bool_], loss_scale: float) 
     return float(robust_costs(errors[np.isfinite(errors)], loss_scale).mean())
 
 
-def _with_copies(model: PosedModel, shared: Container[int], num_images: int) -> PosedModel:
+def _with_copies(
+    model: PosedModel, shared: Container[int], num_images: int, last: int
+) -> PosedModel:
     """Replace cameras of a model by several copies.
 
     Args:
@@ -106,6 +111,8 @@ def _with_copies(model: PosedModel, shared: Container[int], num_images: int) -> 
         shared: ids of the cameras to replace; those that would get a single copy stay.
         num_images: number of consecutive images that share a copy; the last copy may have up to
             twice as many.
+        last: the copies get higher ids than this. It is not exceeded by the ids of cameras of other
+            models, which would otherwise be confused with the copies.
     """
     count = Counter(image.camera_id for image in model.images)
     place = dict.fromkeys(count, 0)
@@ -117,7 +124,7 @@ def _with_copies(model: PosedModel, shared: Container[int], num_images: int) -> 
         if num_copies > 1:
             part = number, min(place[number] // num_images, num_copies - 1)
             if part not in copies:
-                copies[part] = max(cameras) + 1
+                copies[part] = last + len(copies) + 1
                 cameras[copies[part]] = copy.copy(model.cameras[number])
                 cameras[copies[part]].camera_id = copies[part]
             place[number] += 1

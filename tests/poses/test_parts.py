@@ -50,15 +50,14 @@ def seam(image_set: ImageSet, before: int) -> tuple[str, str]:
     return image_set.images.names[before], image_set.images.names[before + 1]
 
 
-def stretch(image_set: ImageSet, *index: int) -> list[list[int]]:
-    """Points that give a stretch of images depth."""
-    assert max(index) < len(image_set.sequence)
+def stretch(*index: int) -> list[list[int]]:
+    """Points with depth in some images."""
     return [list(index)] * 200
 
 
 def test_model_is_split_at_a_seam_with_few_points() -> None:
     image_set = images(30)
-    own = [*stretch(image_set, 0, 12), *stretch(image_set, 13, 29)]
+    own = [*stretch(0, 12), *stretch(13, 29)]
     few = model(image_set, [*own, *[[11, 12, 13, 14]] * 10])
     first, second = parts_of(few, image_set, [seam(image_set, 12)])
     assert (first, second) == (names(image_set, *range(13, 30)), names(image_set, *range(13)))
@@ -68,7 +67,7 @@ def test_model_is_split_at_a_seam_with_few_points() -> None:
 
 def test_points_without_parallax_on_either_side_do_not_join_parts() -> None:
     image_set = images(30)
-    own = [*stretch(image_set, 0, 12), *stretch(image_set, 13, 29)]
+    own = [*stretch(0, 12), *stretch(13, 29)]
     for views in ([12, 13], [11, 12, 13], [0, 29]):
         known = model(image_set, [*own, *[views] * 1000])
         assert len(parts_of(known, image_set, [seam(image_set, 12)])) == 2
@@ -77,7 +76,7 @@ def test_points_without_parallax_on_either_side_do_not_join_parts() -> None:
 def test_a_stretch_without_parallax_joins_no_parts() -> None:
     image_set = images(36)
     seams = [seam(image_set, 14), seam(image_set, 15)]
-    own = [*stretch(image_set, 0, 14), *stretch(image_set, 16, 35)]
+    own = [*stretch(0, 14), *stretch(16, 35)]
     known = model(image_set, [*own, *[[0, 15]] * 200, *[[15, 35]] * 200])
     first, second = parts_of(known, image_set, seams)
     assert (first, second) == (names(image_set, *range(16, 36)), names(image_set, *range(15)))
@@ -86,7 +85,7 @@ def test_a_stretch_without_parallax_joins_no_parts() -> None:
 def test_a_revisited_place_joins_parts() -> None:
     image_set = images(36)
     seams = [seam(image_set, 11), seam(image_set, 23)]
-    own = [*stretch(image_set, 0, 11), *stretch(image_set, 12, 23), *stretch(image_set, 24, 35)]
+    own = [*stretch(0, 11), *stretch(12, 23), *stretch(24, 35)]
     assert len(parts_of(model(image_set, [*own, *[[0, 5, 30, 35]] * 10]), image_set, seams)) == 3
     known = model(image_set, [*own, *[[0, 5, 30, 35]] * 200])
     first, second = parts_of(known, image_set, seams)
@@ -97,7 +96,7 @@ def test_a_revisited_place_joins_parts() -> None:
 def test_another_video_joins_parts() -> None:
     image_set = images(24, 12)
     seams = [seam(image_set, 11)]
-    apart = [*stretch(image_set, 0, 1, 24), *stretch(image_set, 12, 23)]
+    apart = [*stretch(0, 1, 24), *stretch(12, 23)]
     assert len(parts_of(model(image_set, apart), image_set, seams)) == 2
     assert len(parts_of(model(image_set, [*apart, *[[23, 30]] * 30]), image_set, seams)) == 1
 

@@ -13,7 +13,6 @@ from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
 from colmap_av1.poses.pose_stages import (
     MappedResult,
-    mapper_models,
     num_nearest,
     with_model_first,
 )
@@ -48,10 +47,9 @@ def test_another_model_of_the_mapper_becomes_the_first(tmp_path: Path) -> None:
         other_models=("poses/1.npz",),
     )
     mapped = Kept(found, digest="0", resumed=False)
-    assert mapper_models(mapped) == ["poses/1.npz"]
     run = cast("Run", SimpleNamespace(stages=tmp_path))
     changed = with_model_first(run, mapped, keyed, "poses/1.npz")
     assert (changed.result.poses, changed.result.num_registered) == ("poses/1.npz", 7)
     assert changed.result.registered == {"a": 3, "b": 4}
-    assert mapper_models(changed) == ["poses/0.npz"]
+    assert changed.result.other_models == ("poses/0.npz",)
     assert changed.digest != mapped.digest
