@@ -14,7 +14,8 @@ from conftest import PROJECT, Ffmpeg
 import colmap_av1
 
 FUNCTIONS = [name for name in colmap_av1.__all__ if name.islower()]
-CLASSES = ["FrameMotion", "MatchOptions", "ReconstructOptions", "Tracks"]
+OPTIONS = [name for name in colmap_av1.__all__ if name.endswith("Options")]
+CLASSES = ["FrameMotion", "Tracks"]
 # Examples that read the output of another example.
 NEEDS = {
     "check_database": "match",
@@ -58,7 +59,7 @@ def run(ffmpeg: Ffmpeg, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ru
         yield run_example
 
 
-@pytest.mark.parametrize("name", [*FUNCTIONS, *CLASSES])
+@pytest.mark.parametrize("name", [*FUNCTIONS, *CLASSES, *OPTIONS])
 def test_docstring_example_works(run: Run, name: str) -> None:
     count, failures = run(name)
     assert count > 0, f"the docstring of {name} has no example"

@@ -30,6 +30,15 @@ _ABOUT_NAMES = (
     "'-' and '_' are equivalent in option names. COLMAP's spellings are accepted, such as "
     "--ImageReader.camera_model."
 )
+_EXAMPLES = f"""\
+examples:
+  {PROGRAM} match --database my.db --video phone.mp4 --image_path my_frames
+      matches for COLMAP's mapper; also writes the images
+  {PROGRAM} reconstruct --video phone.mp4 --output my_scene
+      a dense model with undistorted images, for splat trainers
+  {PROGRAM} densify --model my_model/0 --video phone.mp4 --output my_dense_model
+      dense points for an existing model of the video
+"""
 _INTERRUPTED = 130
 _BROKEN_PIPE = 141
 
@@ -129,8 +138,9 @@ def make_parser(names: Collection[str]) -> tuple[Parser, Mapping[str, Parser]]:
     """The program's parser, and those of its commands; only the named ones get arguments."""
     parser = Parser(
         prog=PROGRAM,
-        description="Dense COLMAP matches read from the motion vectors of an AV1 video.",
-        epilog=_ABOUT_NAMES,
+        description="COLMAP matches and models from the motion vectors of an AV1 video.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     parsers = parser.add_subparsers(

@@ -17,7 +17,14 @@ _SHARD = re.compile(r"(\d+)/(\d+)", re.ASCII)
 
 @dataclass(frozen=True)
 class BatchOptions(Options):
-    """Where the videos of a batch are processed, and how failures are handled."""
+    """Where the videos of a batch are processed, and how failures are handled.
+
+    Examples:
+        >>> from colmap_av1 import BatchOptions
+        >>> options = BatchOptions(shard="2/10", timeout=3600)
+        >>> options.engine
+        'local'
+    """
 
     title: ClassVar[str] = "batch"
 

@@ -24,7 +24,14 @@ _LONGEST_READ_OUT = 100
 
 @dataclass(frozen=True)
 class CameraOptions(Options):
-    """The camera written for new images."""
+    """The camera written for new images.
+
+    Examples:
+        >>> from colmap_av1 import CameraOptions, MatchOptions
+        >>> camera = CameraOptions("SIMPLE_PINHOLE", "600,320,240")
+        >>> MatchOptions(camera=camera).camera.camera_model
+        'SIMPLE_PINHOLE'
+    """
 
     title: ClassVar[str] = "camera"
     colmap_prefix: ClassVar[str] = "ImageReader"

@@ -179,7 +179,14 @@ class ReconstructOptions(Options):
 
 @dataclass(frozen=True)
 class DensifyOptions(Options):
-    """Options of `densify`, including those of `match` for reading, tracks and existing images."""
+    """Options of `densify`, including those of `match` for reading, tracks and existing images.
+
+    Examples:
+        >>> from colmap_av1 import DensifyOptions, TriangulateOptions
+        >>> options = DensifyOptions(triangulate=TriangulateOptions(points="survey"))
+        >>> options.triangulate.points
+        'survey'
+    """
 
     title: ClassVar[str] = "dense points"
 

@@ -33,7 +33,14 @@ _OPERATOR = re.compile(r"&|&&|\||\|\||;|\d*[<>].*")
 
 @dataclass(frozen=True)
 class LearnedOptions(Options):
-    """How learned features are extracted and matched for a comparison."""
+    """How learned features are extracted and matched for a comparison.
+
+    Examples:
+        >>> from colmap_av1 import CompareOptions, LearnedOptions
+        >>> options = CompareOptions(learned=LearnedOptions(max_keypoints=4096))
+        >>> options.learned.max_keypoints
+        4096
+    """
 
     title: ClassVar[str] = "learned features"
 
@@ -59,7 +66,14 @@ class LearnedOptions(Options):
 
 @dataclass(frozen=True)
 class CompareOptions(Options):
-    """Options of `compare`, with those of `match` except track selection and existing rows."""
+    """Options of `compare`, with those of `match` except track selection and existing rows.
+
+    Examples:
+        >>> from colmap_av1 import CompareOptions
+        >>> options = CompareOptions(frontends=("av1", "sift-sequential"))
+        >>> options.frontends
+        ('av1', 'sift-sequential')
+    """
 
     title: ClassVar[str] = "comparison"
 

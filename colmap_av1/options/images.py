@@ -20,7 +20,14 @@ _LONGEST_NAME = 255  # bytes, on all usual file systems
 
 @dataclass(frozen=True)
 class ImageOptions(Options):
-    """Which frames of the video become images: all, unless an option chooses among them."""
+    """Which frames of the video become images: all, unless an option chooses among them.
+
+    Examples:
+        >>> from colmap_av1 import ImageOptions, MatchOptions
+        >>> options = MatchOptions(images=ImageOptions(fps=2.0))
+        >>> options.images.fps
+        2.0
+    """
 
     title: ClassVar[str] = "images"
 
@@ -86,7 +93,14 @@ class ImageOptions(Options):
 
 @dataclass(frozen=True)
 class MaskOptions(Options):
-    """Masks of the pixels to ignore."""
+    """Masks of the pixels to ignore.
+
+    Examples:
+        >>> from colmap_av1 import MaskOptions, MatchOptions
+        >>> options = MatchOptions(masks=MaskOptions("my_masks"))
+        >>> options.masks.mask_path
+        'my_masks'
+    """
 
     title: ClassVar[str] = "masks"
     colmap_prefix: ClassVar[str] = "ImageReader"

@@ -14,7 +14,14 @@ MIN_MATCHES = 8
 
 @dataclass(frozen=True)
 class PairOptions(Options):
-    """Which image pairs are written."""
+    """Which image pairs are written.
+
+    Examples:
+        >>> from colmap_av1 import MatchOptions, PairOptions
+        >>> options = MatchOptions(pairs=PairOptions(offsets=(1, 2, 4, 8)))
+        >>> options.pairs.offsets
+        (1, 2, 4, 8)
+    """
 
     title: ClassVar[str] = "image pairs"
 
@@ -44,7 +51,14 @@ class PairOptions(Options):
 
 @dataclass(frozen=True)
 class LinkOptions(Options):
-    """SIFT links between images that motion does not connect."""
+    """SIFT links between images that motion does not connect.
+
+    Examples:
+        >>> from colmap_av1 import LinkOptions, MatchOptions
+        >>> options = MatchOptions(links=LinkOptions("none"))
+        >>> options.links.links
+        'none'
+    """
 
     title: ClassVar[str] = "links"
 
@@ -63,7 +77,14 @@ class LinkOptions(Options):
 
 @dataclass(frozen=True)
 class VerifyOptions(Options):
-    """How matches are verified; the thresholds of two-view geometries are COLMAP's defaults."""
+    """How matches are verified; the thresholds of two-view geometries are COLMAP's defaults.
+
+    Examples:
+        >>> from colmap_av1 import MatchOptions, VerifyOptions
+        >>> options = MatchOptions(verify=VerifyOptions("pairs"))
+        >>> options.verify.verify
+        'pairs'
+    """
 
     title: ClassVar[str] = "two-view geometry"
     colmap_prefix: ClassVar[str] = "TwoViewGeometry"

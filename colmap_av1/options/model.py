@@ -13,7 +13,14 @@ Mapper = Literal["incremental", "global"]
 
 @dataclass(frozen=True)
 class TriangulateOptions(Options):
-    """Which tracks become points."""
+    """Which tracks become points.
+
+    Examples:
+        >>> from colmap_av1 import ReconstructOptions, TriangulateOptions
+        >>> options = ReconstructOptions(triangulate=TriangulateOptions(points="survey"))
+        >>> options.triangulate.points
+        'survey'
+    """
 
     title: ClassVar[str] = "points"
 
@@ -71,7 +78,14 @@ class TriangulateOptions(Options):
 
 @dataclass(frozen=True)
 class MapOptions(Options):
-    """How a database is mapped."""
+    """How a database is mapped.
+
+    Examples:
+        >>> from colmap_av1 import MapOptions
+        >>> options = MapOptions(mapper="global")
+        >>> options.mapper, options.forward_motion
+        ('global', False)
+    """
 
     title: ClassVar[str] = "mapper"
 
@@ -114,7 +128,14 @@ class MapOptions(Options):
 
 @dataclass(frozen=True)
 class MapperOptions(Options):
-    """How poses are estimated."""
+    """How poses are estimated.
+
+    Examples:
+        >>> from colmap_av1 import MapperOptions, ReconstructOptions
+        >>> options = ReconstructOptions(mapping=MapperOptions(mapper="incremental"))
+        >>> options.mapping.mapper
+        'incremental'
+    """
 
     title: ClassVar[str] = "poses"
 
@@ -154,7 +175,13 @@ class MapperOptions(Options):
 
 @dataclass(frozen=True)
 class ExportOptions(Options):
-    """What is exported from a database."""
+    """What is exported from a database.
+
+    Examples:
+        >>> from colmap_av1 import ExportOptions
+        >>> ExportOptions(verified=False)
+        ExportOptions(format='hloc', verified=False)
+    """
 
     title: ClassVar[str] = "files"
 

@@ -48,7 +48,14 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class PlaceOptions(Options):
-    """How a model is placed in world coordinates."""
+    """How a model is placed in world coordinates.
+
+    Examples:
+        >>> from colmap_av1 import PlaceOptions, ReconstructOptions
+        >>> options = ReconstructOptions(place=PlaceOptions(align="none"))
+        >>> options.place.align
+        'none'
+    """
 
     title: ClassVar[str] = "place and scale"
 

@@ -10,7 +10,14 @@ from colmap_av1.options.fields import Options, option
 
 @dataclass(frozen=True)
 class RunOptions(Options):
-    """Options that all stages of a run share."""
+    """Options that all stages of a run share.
+
+    Examples:
+        >>> from colmap_av1 import MatchOptions, RunOptions
+        >>> options = MatchOptions(run=RunOptions(num_threads=4, seed=1))
+        >>> options.run.seed
+        1
+    """
 
     title: ClassVar[str] = "run"
     # COLMAP's group for the seed and the threads.

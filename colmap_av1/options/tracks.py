@@ -15,7 +15,14 @@ _LARGEST_WINDOW = 101  # in pixels; a template of each track is kept in memory
 
 @dataclass(frozen=True)
 class TrackOptions(Options):
-    """How displacements are chained into tracks."""
+    """How displacements are chained into tracks.
+
+    Examples:
+        >>> from colmap_av1 import MatchOptions, TrackOptions
+        >>> options = MatchOptions(tracks=TrackOptions(min_length=6))
+        >>> options.tracks.min_length
+        6
+    """
 
     title: ClassVar[str] = "tracks"
 
@@ -112,7 +119,14 @@ class TrackOptions(Options):
 
 @dataclass(frozen=True)
 class RefineOptions(Options):
-    """How track positions are refined on decoded pictures."""
+    """How track positions are refined on decoded pictures.
+
+    Examples:
+        >>> from colmap_av1 import MatchOptions, RefineOptions
+        >>> options = MatchOptions(refine=RefineOptions("lk"))
+        >>> options.refine.refine
+        'lk'
+    """
 
     title: ClassVar[str] = "refinement"
 
@@ -145,7 +159,14 @@ class RefineOptions(Options):
 
 @dataclass(frozen=True)
 class DensityOptions(Options):
-    """Which tracks are used; options that are None are set by the preset."""
+    """Which tracks are used; options that are None are set by the preset.
+
+    Examples:
+        >>> from colmap_av1 import DensityOptions, MatchOptions
+        >>> options = MatchOptions(density=DensityOptions("sparse"))
+        >>> options.density.preset
+        'sparse'
+    """
 
     title: ClassVar[str] = "selection of tracks"
 

@@ -13,7 +13,14 @@ _NUM_OPERATING_POINTS = 32  # the most that a sequence header can describe (5.5.
 
 @dataclass(frozen=True)
 class ReadOptions(Options):
-    """How the bitstream is read."""
+    """How the bitstream is read.
+
+    Examples:
+        >>> from colmap_av1 import MatchOptions, ReadOptions
+        >>> options = MatchOptions(read=ReadOptions(strict=True))
+        >>> options.read.strict
+        True
+    """
 
     title: ClassVar[str] = "bitstream"
 
@@ -44,7 +51,14 @@ class ReadOptions(Options):
 
 @dataclass(frozen=True)
 class EncodeOptions(Options):
-    """How a video that is not AV1 is converted."""
+    """How a video that is not AV1 is converted.
+
+    Examples:
+        >>> from colmap_av1 import EncodeOptions, MatchOptions
+        >>> options = MatchOptions(encode=EncodeOptions(encoder="libaom"))
+        >>> options.encode.encoder
+        'libaom'
+    """
 
     title: ClassVar[str] = "conversion of a video that is not AV1"
 

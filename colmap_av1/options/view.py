@@ -10,7 +10,14 @@ from colmap_av1.options.fields import Options, option
 
 @dataclass(frozen=True)
 class ViewOptions(Options):
-    """How motion and tracks are drawn over the frames of a video."""
+    """How motion and tracks are drawn over the frames of a video.
+
+    Examples:
+        >>> from colmap_av1 import ViewOptions
+        >>> options = ViewOptions(draw="tracks", tail=20)
+        >>> options.tail
+        20
+    """
 
     title: ClassVar[str] = "drawing"
 

@@ -49,8 +49,9 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
     First, observations are removed whose error, relative to the first observation of their track,
     exceeds `max_sigma`. Observations with a wide baseline may have a larger error, up to a
     thirtieth of the distance from the first observation. In each image, a baseline is wide that is
-    nearly as long as the longest ones. Of these observations, the `wide_tracks` with the smallest
-    error relative to the distance are kept, and all others of the image that are as accurate.
+    nearly as long as the longest ones. The `wide_tracks` observations with a wide baseline and the
+    smallest error relative to the distance are kept, and all others of the image that are as
+    accurate.
 
     Then tracks are selected, the best first. The weight of a track is the sum of the inverse
     expected variances of its observations. A track is selected if at least half of its observations

@@ -266,7 +266,7 @@ def _check_cdf(table: _Table) -> None:
         probabilities, counter = row[:-1], row[-1]
         increasing = all(a < b for a, b in pairwise(probabilities))
         if not increasing or probabilities[0] <= 0 or probabilities[-1] != _CDF_ONE or counter != 0:
-            raise ValueError(f"{table.name}: the row {row} is no CDF; check the specification")
+            raise ValueError(f"{table.name}: the row {row} is not a CDF; check the specification")
 
 
 def _read_tables(text: str, constants: dict[str, int]) -> list[_Table]:
@@ -337,7 +337,7 @@ def _definitions(tables: list[_Table], specifiers: str) -> str:
     definitions = []
     for table in tables:
         if isinstance(table.values, int):
-            raise ValueError(f"{table.name} is no array; check the specification")
+            raise ValueError(f"{table.name} is not an array; check the specification")
         definitions.append(f"{_format(table.values, '', f'{specifiers} {table.declaration} = ')};")
     return "\n\n".join(definitions)
 

@@ -33,7 +33,7 @@ std::vector<double> widest_angles(std::span<const double> centres, std::span<con
 struct HangingOptions {
   double before = 0;   // largest distance of a floater, as a share of the median in its square
   double as_near = 0;  // points within this ratio of distances support each other
-  std::int64_t support = 0;        // with this many of them, including itself, it is no floater
+  std::int64_t support = 0;        // with this many, including itself, it is not a floater
   double around = 0;               // px; width of the squares
   std::int64_t fewest_around = 0;  // squares with fewer points are ignored
 };

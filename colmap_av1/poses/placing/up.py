@@ -53,9 +53,9 @@ def up_of_cameras(cam_from_world: _Floats) -> _Floats:
 def up_of_gravity(cam_from_world: _Floats, gravity: _Floats) -> tuple[_Floats, float] | None:
     """Up direction from gravity, measured in camera axes of unknown order and signs.
 
-    Manufacturers define these axes differently, and rotate them with the picture. Of all 48 orders
-    and signs, the one is chosen with which gravity is constant in the world and points down in the
-    images.
+    Manufacturers define these axes differently, and rotate them with the picture. All 48 orders and
+    signs are tried. The one is chosen with which gravity is constant in the world and points down
+    in the images.
 
     Args:
         cam_from_world: float64 [n, 3, 4].
