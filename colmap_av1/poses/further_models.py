@@ -34,9 +34,9 @@ _FOLDER = "model_"
 # Few points determine a further model, so its first mapping may be wrong, and its observations too.
 # A correct second mapping agrees with as few as this share of them.
 _LEAST_KEPT = 0.3
-# A model with fewer images than this and than the first keeps the intrinsics of the first. Parts of
-# rendered walks with 10 to 17 images were refined to 0.9 to 2 times the true focal length, those of
-# 24 and more images to 0.99 to 1.02 times, except one.
+# A model with fewer images than this and than the first keeps the intrinsics of the first. In parts
+# of rendered walks with 10 to 17 images, the refined focal length was 0.9 to 2 times the true one;
+# in those with 24 images or more, it was 0.99 to 1.02 times, with one exception.
 _FEW_IMAGES = 30
 
 
@@ -79,8 +79,6 @@ def further_poses(
     """
     first_model = read_posed_model(run.stages / first.last.result.poses)
     left = set(image_set.images.names) - first_model.by_name.keys()
-    cameras = first_model.cameras
-    most_images = min(_FEW_IMAGES, len(first_model.images))
     waiting = _other_models(run, first)
     number = 1
     while waiting:
@@ -89,8 +87,8 @@ def further_poses(
         if len(known & left) < LEAST_IMAGES:  # nearly all of its images are in an earlier model
             continue
         own = _run_of_model(run, number)
-        own_poses = _poses_of_model(own, first, mapped, cameras)
-        if len(known) < most_images and all(i in cameras for i in mapped.model.cameras):
+        own_poses = _poses_of_model(own, first, mapped, first_model.cameras)
+        if keeps_intrinsics(mapped.model, first_model):
             own = _with_known_intrinsics(own)
         free = left.difference(*(other.model.by_name for other in waiting))
         some = _named(image_set, known | free)
@@ -162,6 +160,19 @@ def _run_of_model(run: Run, number: int) -> Run:
     for folder in (own.output, own.stages):
         remove_leftovers(folder)
     return own
+
+
+def keeps_intrinsics(model: PosedModel, first: PosedModel) -> bool:
+    """Whether a further model keeps the intrinsics of the first, which are not refined again.
+
+    A few images do not determine a camera well.
+
+    Args:
+        model: the further model.
+        first: the first model.
+    """
+    is_small = len(model.images) < min(_FEW_IMAGES, len(first.images))
+    return is_small and all(image.camera_id in first.cameras for image in model.images)
 
 
 def _with_known_intrinsics(run: Run) -> Run:
