@@ -338,7 +338,7 @@ def summary(rows: list[Row], *clips: str) -> str:
         ),
         each("CPU time in s", "cpu_s", ".0f"),
         each("3D points", "points", ",.0f"),
-        each("error of camera centres", "ate_of_extent", ".2%"),
+        each("camera position error", "ate_of_extent", ".2%"),
     ]
     return markdown(columns, [{"clip": clip} for clip in clips])
 
