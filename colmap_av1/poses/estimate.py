@@ -228,7 +228,8 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
 
     If pictures far apart in time contradict the poses, it is split at doubtful seams, too. The
     separate adjustment may change the number of points at a seam, so the seams of the largest part
-    are checked again until no split is left.
+    are checked again until no split is left. Motion across a seam is not used any more, because it
+    may be wrong there. Links are: without them, a part that returns to a place would fall apart.
     """
     for number in count(_FIRST_SPLIT):
         if posed.adjustment is None:
@@ -249,7 +250,6 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
             posed,
             mapped=parts,
             tracks=posed.tracks.split_after_frames(frames),
-            links=posed.links.split_after_frames(frames),
         )
         posed = replace(posed, adjustment=_adjusted(run, posed, image_set, parts, number=number))
         if posed.far_views is not None:
