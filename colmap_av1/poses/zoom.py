@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
-from collections.abc import Container
+from collections.abc import Collection, Container
 from dataclasses import replace
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
@@ -45,11 +45,13 @@ def with_own_cameras(run: Run, model: PosedModel) -> Adjusted:
     """
     single_camera = run.options.match.camera.single_camera
     refines = refines_intrinsics(run.options)
-    shared: Container[int] = ()
+    shared: Collection[int] = ()
     if single_camera is False:
         shared = model.cameras
     elif single_camera is None and refines:
         shared = _zooming_cameras(run, model)
+    if not shared:
+        return Adjusted(model, np.arange(len(model.points.xyz)))
     existing = run.cameras.of_images if run.cameras is not None else []
     num_cameras = len(run.inputs.videos) + len(run.inputs.photos)
     last = max(num_cameras, *model.cameras, *(camera.camera_id for camera in existing))

@@ -111,8 +111,7 @@ def test_point_behind_a_camera_is_not_taken_for_a_zoom(truth: Truth, tmp_path: P
     xyz = model.points.xyz.copy()
     xyz[0] = first.cam_from_world[:, :3].T @ ([0.0, 0.0, -1.0] - first.cam_from_world[:, 3])
     behind = replace(model, points=replace(model.points, xyz=xyz))
-    inputs = SimpleNamespace(videos=[SCENE], photos=[])
-    run = SimpleNamespace(options=OPTIONS, stages=tmp_path, inputs=inputs, cameras=None)
+    run = SimpleNamespace(options=OPTIONS, stages=tmp_path)
     found = with_own_cameras(run, behind)
     assert found.model.cameras.keys() == model.cameras.keys()
 
