@@ -33,9 +33,9 @@ FEWEST_IMAGES = 10
 # inliers that COLMAP's mapper requires of a pair of images.
 _BETWEEN_VIDEOS = 15
 # Stretches of one video are connected by at least this many common points that have depth in each
-# of the two stretches by itself. On 13 rendered walks, the scales of straight stretches with at
-# least so many differed by 5 % at most. Those of stretches with no such point differed by up to a
-# factor of 2.7, although they had 100 to 340 points in common.
+# stretch without the views of the other. On 13 rendered walks, the scales of straight stretches
+# with 20 or more such points differed by 5 % at most. Those of stretches with no such point
+# differed by up to a factor of 2.7, although they had 100 to 340 points in common.
 _WITHIN_VIDEO = 20
 
 
@@ -97,8 +97,8 @@ def parts_of(
     """The names of the images of each part of a model, the largest part first.
 
     The images between two seams of a video form a stretch. Stretches belong to the same part if
-    they have enough common points that have depth in each of them by itself: these determine their
-    relative scale. Parts of fewer than ten images are dropped, except the largest.
+    they have enough common points that have depth in each without the views of the other: these
+    determine their relative scale. Parts of fewer than ten images are dropped, except the largest.
 
     Args:
         model: the model with its points.
@@ -136,8 +136,8 @@ def _seen_in_stretches(
         of_image: int64 [num_images] stretch of each image.
 
     Returns:
-        Index of the point and of the stretch, each int64 [n], and whether the point has depth in
-        the stretch by itself, bool [n].
+        Index of the point and of the stretch, each int64 [n], and whether the views of the stretch
+        alone give the point depth, bool [n].
     """
     points = model.points
     point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))

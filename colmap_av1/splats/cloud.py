@@ -58,8 +58,8 @@ def splat_cloud(
 ) -> ModelPoints:
     """Thin points of tracks evenly in the images, and fill holes.
 
-    Of nearby points on the same surface, the one with the most observations is kept. Empty cells of
-    an image get points at the depth of their surroundings, observed by that image and its
+    Among nearby points on the same surface, the one with the most observations is kept. Empty cells
+    of an image get points at the depth of their surroundings, observed by that image and its
     neighbours. Masked pixels are not holes.
 
     Args:
