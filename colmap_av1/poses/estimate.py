@@ -217,10 +217,11 @@ def _decided(
 
 def _larger_model(run: Run, mapped: _Mapped, size: int, image_set: ImageSet) -> str | None:
     """The file of the mapper's second model; None if it has no more than `size` images."""
-    for file in mapped.mapped.result.other_models[:1]:  # they are sorted by size
-        if num_nearest(read_posed_model(run.stages / file), image_set, mapped.keyed) > size:
-            return file
-    return None
+    others = mapped.mapped.result.other_models  # sorted by size
+    if not others:
+        return None
+    second = read_posed_model(run.stages / others[0])
+    return others[0] if num_nearest(second, image_set, mapped.keyed) > size else None
 
 
 def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:

@@ -58,8 +58,6 @@ from colmap_av1.util.digests import digest_of
 from colmap_av1.util.progress import progress_in
 from colmap_av1.util.stages import Kept, run_stage
 
-# Folder of the models of the mapper.
-_MODELS = "poses"
 # With fewer tracks per image than this, a failed initialization is blamed on the tracks.
 _FEW_TRACKS = 100
 # The selection of tracks for bundle adjustment.
@@ -187,8 +185,8 @@ def pose_stage(
         if not found:
             raise ModelError(_why_no_initial_pair(found_before, attempt.mapper))
         found = _largest_first(found, image_set, keyed)
-        (partial / _MODELS).mkdir()
-        files = [f"{_MODELS}/{number}.npz" for number in range(len(found))]
+        (partial / "poses").mkdir()
+        files = [f"poses/{number}.npz" for number in range(len(found))]
         for file, model in zip(files, found, strict=True):
             write_posed_model(partial / file, model)
         return MappedResult(
@@ -205,7 +203,7 @@ def pose_stage(
         [matched.digest, attempts, START_TRACKS, mapping.adjust, ends_early, pycolmap.__version__],
         MappedResult,
         into=run.stages,
-        products=[_MODELS],
+        products=["poses"],
         make=make,
     )
 
