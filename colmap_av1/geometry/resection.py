@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.digests import seed_of
+from colmap_av1.util.threads import map_on_threads
 
 _Floats = NDArray[np.float64]
 
@@ -120,11 +119,10 @@ def resect(
         )
 
     found: list[_Floats | None] = []
-    with ThreadPoolExecutor(max_workers=threads_or_cpus(num_threads)) as executor:
-        for pose in executor.map(work, range(len(guesses))):
-            found.append(pose)
-            if progress is not None:
-                progress(len(found))
+    for pose in map_on_threads(work, range(len(guesses)), num_threads):
+        found.append(pose)
+        if progress is not None:
+            progress(len(found))
     return found
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.options import TriangulateOptions
-from colmap_av1.util.cpus import threads_or_cpus
+from colmap_av1.util.threads import map_on_threads
 
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
@@ -138,16 +137,10 @@ def triangulate(
 
     none = np.empty(0, np.int64)
     parts: list[_Part] = [(np.empty((0, 3)), np.empty(0), none, none, 0, 0)]
-    # Threads run in parallel because the core releases the GIL.
-    with ThreadPoolExecutor(max_workers=threads_or_cpus(num_threads)) as executor:
-        try:
-            for index, part in enumerate(executor.map(work, range(len(bounds) - 1))):
-                parts.append(part)
-                if progress is not None:
-                    progress(int(bounds[index + 1]))
-        except BaseException:
-            executor.shutdown(wait=True, cancel_futures=True)
-            raise
+    for index, part in enumerate(map_on_threads(work, range(len(bounds) - 1), num_threads)):
+        parts.append(part)
+        if progress is not None:
+            progress(int(bounds[index + 1]))
     xyz, error, counts, observation, num_agreeing, num_tracks = zip(*parts, strict=True)
     return TriangulatedPoints(
         xyz=np.concatenate(xyz),

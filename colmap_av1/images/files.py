@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 try:
@@ -28,20 +27,20 @@ from colmap_av1.images.names import (
     pattern_regex,
 )
 from colmap_av1.options.images import check_extension
-from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.files import may_read, remove_leftovers, whole_file
 from colmap_av1.util.memory import check_memory
 from colmap_av1.util.spread import evenly_spread
+from colmap_av1.util.threads import map_on_threads
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
 
+_Image = NDArray[np.uint8]
+
 # Extensions of images that can be read.
 READABLE = {*WRITE_PARAMETERS, ".bmp", ".tif", ".tiff", ".webp"}
-# Number of frames per thread that wait for compression. It bounds memory.
-_QUEUE_PER_THREAD = 2
 # Longer side in pixels at which detail is measured. Larger pictures are often soft at full size,
 # which does no harm.
 _DETAIL_SIZE = 960
@@ -232,7 +231,8 @@ def write_images(
     *,
     num_threads: int | None = None,
     operating_point: int = 0,
-    change: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]] | None = None,
+    change: Callable[[int, _Image], _Image] | None = None,
+    look: Callable[[int, _Image], None] | None = None,
     display: Display | None = None,
     kept: KeptPictures | None = None,
     progress: Callable[[int], None] | None = None,
@@ -249,8 +249,9 @@ def write_images(
         frames: display index of each image.
         num_threads: number of threads; None: one per CPU.
         operating_point: operating point of a scalable stream.
-        change: called with (display_index, picture) of each missing image in display order;
+        change: called on several threads with (display_index, picture) of each missing image;
             returns the picture to write.
+        look: called with (display_index, written picture) of each missing image, in display order.
         display: how pictures are cropped and rotated; None: as players do.
         kept: store of decoded pictures, which are not decoded again.
         progress: called with the number of images done so far.
@@ -277,6 +278,12 @@ def write_images(
         if progress is not None:
             progress(num_kept + num_written)
 
+    def write(shown: tuple[int, _Image]) -> tuple[int, _Image]:
+        index, picture = shown
+        picture = change(index, picture) if change is not None else picture
+        write_image(wanted[index], picture)
+        return index, picture
+
     report(0)
     if not wanted:
         return 0
@@ -302,7 +309,11 @@ def write_images(
                 kept=kept,
             )
             with contextlib.closing(decoded):
-                _write_frames(decoded, wanted, change, threads_or_cpus(num_threads), report)
+                written = map_on_threads(write, _pictures(decoded, wanted), num_threads)
+                for done, (index, picture) in enumerate(written, start=1):
+                    if look is not None:
+                        look(index, picture)
+                    report(done)
     except VideoError:  # a later run would mix these images with those of the new video
         for path in wanted.values():
             path.unlink(missing_ok=True)
@@ -313,50 +324,32 @@ def write_images(
     return len(wanted)
 
 
-def _write_frames(
-    decoded: Iterator[tuple[int, NDArray[np.uint8]]],
-    wanted: Mapping[int, Path],
-    change: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]] | None,
-    num_threads: int,
-    report: Callable[[int], None],
-) -> None:
-    """Write the wanted frames on threads; `report` is called with the number written so far."""
+def _pictures(
+    decoded: Iterable[tuple[int, _Image]], wanted: Collection[int]
+) -> Iterator[tuple[int, _Image]]:
+    """Yield the wanted ones of decoded frames, which must have one size."""
     size: tuple[int, ...] | None = None
-    queue: list[Future[None]] = []
-    num_taken = 0
-    last = max(wanted)
-    # OpenCV releases the interpreter lock while it compresses.
-    with ThreadPoolExecutor(max_workers=num_threads) as executor:
-        try:
-            for index, picture in decoded:
-                size = size or picture.shape
-                if picture.shape != size:
-                    raise ImageError(
-                        f"frame {index} is {picture.shape[1]}x{picture.shape[0]}, earlier ones are "
-                        f"{size[1]}x{size[0]}: images of one camera cannot change their size; "
-                        "re-encode the video at one size"
-                    )
-                if index in wanted:
-                    image = change(index, picture) if change is not None else picture
-                    queue.append(executor.submit(write_image, wanted[index], image))
-                    num_taken += 1
-                while len(queue) > (num_threads * _QUEUE_PER_THREAD if index < last else 0):
-                    queue.pop(0).result()
-                    report(num_taken - len(queue))
-                if index >= last:
-                    break
-            for future in queue:  # not empty if the decoder ends early
-                future.result()
-        finally:
-            executor.shutdown(wait=True, cancel_futures=True)
-    if num_taken < len(wanted):
-        raise ImageError(
-            f"the decoder returns no frame {sorted(wanted)[num_taken]} of the {last + 1} that the "
-            "stream shows: leave out the images, or re-encode the video"
-        )
+    left = set(wanted)
+    for index, picture in decoded:
+        size = size or picture.shape
+        if picture.shape != size:
+            raise ImageError(
+                f"frame {index} is {picture.shape[1]}x{picture.shape[0]}, earlier ones are "
+                f"{size[1]}x{size[0]}: images of one camera cannot change their size; "
+                "re-encode the video at one size"
+            )
+        if index in left:
+            left.remove(index)
+            yield index, picture
+        if not left:
+            return
+    raise ImageError(
+        f"the decoder returns no frame {min(left)} of the {max(wanted) + 1} that the stream "
+        "shows: leave out the images, or re-encode the video"
+    )
 
 
-def read_image(path: Path) -> NDArray[np.uint8]:
+def read_image(path: Path) -> _Image:
     """Read an image file: uint8 [height, width, 3] BGR.
 
     Raises:
@@ -406,7 +399,7 @@ def blur_warning(files: Sequence[Path]) -> str | None:
     return None
 
 
-def _detail(grey: NDArray[np.uint8]) -> float:
+def _detail(grey: _Image) -> float:
     """Share of the pixels that have detail."""
     height, width = grey.shape
     half = (max(1, width // 2), max(1, height // 2))
@@ -415,7 +408,7 @@ def _detail(grey: NDArray[np.uint8]) -> float:
     return float(np.mean(cv2.absdiff(grey, again) > _VISIBLE))
 
 
-def _detail_by_direction(grey: NDArray[np.uint8]) -> list[float]:
+def _detail_by_direction(grey: _Image) -> list[float]:
     """Share of the pixels that have detail along rows, columns and both diagonals."""
     return [
         float(np.mean(np.abs(cv2.filter2D(grey, cv2.CV_32F, kernel)) > _VISIBLE))
@@ -423,7 +416,7 @@ def _detail_by_direction(grey: NDArray[np.uint8]) -> list[float]:
     ]
 
 
-def grey_within(picture: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+def grey_within(picture: _Image, longest: int) -> NDArray[np.uint8]:
     """Convert a BGR picture to grey, downscaled if its longer side exceeds `longest` pixels."""
     scale = min(1.0, longest / max(picture.shape[:2]))
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
@@ -454,7 +447,7 @@ def image_size(path: Path) -> tuple[int, int]:
     return size
 
 
-def write_image(path: Path, image: NDArray[np.uint8]) -> None:
+def write_image(path: Path, image: _Image) -> None:
     """Write an image (BGR), PNG or JPEG by its extension; it appears when it is complete.
 
     Raises:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +33,7 @@ from colmap_av1.options import VerifyOptions
 from colmap_av1.options.matching import MIN_MATCHES
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.digests import seed_of
+from colmap_av1.util.threads import map_on_threads
 
 _Floats = NDArray[np.float64]
 
@@ -111,19 +111,14 @@ def verify_pairs(
     parts = [indices[start : start + _PAIRS_AT_A_TIME] for start in indices[::_PAIRS_AT_A_TIME]]
     num_threads = min(threads_or_cpus(num_threads), 1 + len(pairs) // _PAIRS_FOR_A_THREAD)
     # PoseLib and NumPy's loops release the interpreter lock, so threads are enough.
-    with ThreadPoolExecutor(max_workers=num_threads) as executor:
-        try:
-            for part, found in zip(parts, executor.map(verify, parts), strict=True):
-                for image in np.unique(pairs[part.start : part.stop]).tolist():
-                    if last_pair[image] < part.stop:
-                        views.pop(image, None)
-                for geometry in found:
-                    geometries.append(geometry)
-                    if progress is not None:
-                        progress(len(geometries))
-        except BaseException:
-            executor.shutdown(wait=True, cancel_futures=True)
-            raise
+    for part, found in zip(parts, map_on_threads(verify, parts, num_threads), strict=True):
+        for image in np.unique(pairs[part.start : part.stop]).tolist():
+            if last_pair[image] < part.stop:
+                views.pop(image, None)
+        for geometry in found:
+            geometries.append(geometry)
+            if progress is not None:
+                progress(len(geometries))
     return geometries
 
 

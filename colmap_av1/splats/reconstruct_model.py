@@ -118,10 +118,10 @@ def _written_images(
     names = [image.name for image in placed.images]
 
     def change(first: int, frame: int, picture: _Image) -> _Image:
-        index = index_of_frame[first + frame]
-        shown = _undistorted(picture, undistort(index))
-        look(index, shown)
-        return shown
+        return _undistorted(picture, undistort(index_of_frame[first + frame]))
+
+    def look_at(first: int, frame: int, picture: _Image) -> None:
+        look(index_of_frame[first + frame], picture)
 
     done = 0
 
@@ -140,6 +140,7 @@ def _written_images(
                 num_threads=options.match.run.num_threads,
                 operating_point=options.match.read.operating_point,
                 change=functools.partial(change, first),
+                look=functools.partial(look_at, first),
                 kept=run.sources[sequence].kept,
                 progress=report,
             )

@@ -126,6 +126,7 @@ def look(scene: Scene, pictures: GreyPictures, views: list[PosedCamera] | None =
         views=scene.views if views is None else views,
         frames=np.arange(len(POSES), dtype=np.int32),
         pictures=pictures,
+        num_threads=2,
         progress=seen.append,
     )
     assert seen == list(range(1, len(POSES) + 1))

@@ -27,6 +27,7 @@ from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import LinkOptions, VerifyOptions
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.threads import map_on_threads
 
 # Up to this number of pairs, all are matched, because retrieval would not be faster.
 _MAX_EXHAUSTIVE_PAIRS = 200
@@ -74,12 +75,17 @@ def features_of_images(
 ) -> dict[int, Features]:
     """Extract features outside masked pixels; positions are in pixels of the images."""
     found: dict[int, Features] = {}
-    for image, picture in pictures(wanted):
+
+    def features_of(shown: tuple[int, NDArray[np.uint8]]) -> tuple[int, Features]:
+        image, picture = shown
         features = extract_features(picture, options.max_link_features, effort)
         features = masked_features(features, picture, masks[image])
         width, height = int(cameras[image].width), int(cameras[image].height)
         scale = np.array([width / picture.shape[1], height / picture.shape[0]], np.float32)
-        found[image] = replace(features, xy=features.xy * scale)
+        return image, replace(features, xy=features.xy * scale)
+
+    for image, features in map_on_threads(features_of, pictures(wanted), context.num_threads):
+        found[image] = features
         context.progress("links", len(found), len(wanted))
     return found
 
@@ -171,8 +177,12 @@ def match_pairs(
     pairs = pairs[np.array(there, dtype=np.bool_)]
     matches = []
     with one_blas_thread():
-        for i, j in pairs.tolist():
-            matches.append(match_features(features[i], features[j]))
+
+        def match(pair: list[int]) -> NDArray[np.uint32]:
+            return match_features(features[pair[0]], features[pair[1]])
+
+        for found in map_on_threads(match, pairs.tolist(), context.num_threads):
+            matches.append(found)
             context.progress("link matches", len(matches), len(pairs))
     options = replace(verify, min_num_inliers=max(verify.min_num_inliers, _MIN_GAP_INLIERS))
     geometries = verify_pairs(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import threading
 from pathlib import Path
 from types import TracebackType
 
@@ -19,6 +20,7 @@ class GreyPictures:
     def __init__(self, folder: Path) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by __exit__
         self._at: dict[int, tuple[int, tuple[int, int]]] = {}
+        self._lock = threading.Lock()
 
     def __enter__(self) -> GreyPictures:
         return self
@@ -42,10 +44,12 @@ class GreyPictures:
         self._file.write(grey.tobytes())
 
     def read(self, image: int) -> NDArray[np.uint8]:
-        """The picture of an image."""
+        """The picture of an image. Several threads may call it."""
         start, shape = self._at[image]
-        self._file.seek(start)
-        return np.frombuffer(self._file.read(shape[0] * shape[1]), np.uint8).reshape(shape)
+        with self._lock:
+            self._file.seek(start)
+            pixels = self._file.read(shape[0] * shape[1])
+        return np.frombuffer(pixels, np.uint8).reshape(shape)
 
     def size(self, image: int) -> tuple[int, int]:
         """The (width, height) of the picture of an image."""

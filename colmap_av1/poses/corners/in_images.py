@@ -107,6 +107,7 @@ def _match_in_all(
         views=views,
         frames=placed.frames,
         pictures=pictures,
+        num_threads=run.options.match.run.num_threads,
         progress=report,
     )
 

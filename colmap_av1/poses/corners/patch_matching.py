@@ -24,6 +24,7 @@ from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.slopes import surface_slopes
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.spread import evenly_spread
+from colmap_av1.util.threads import map_on_threads
 
 _Floats = NDArray[np.float64]
 _Indices = NDArray[np.int64]
@@ -85,6 +86,7 @@ def match_patches(
     views: Sequence[PosedCamera],
     frames: NDArray[np.int32],
     pictures: GreyPictures,
+    num_threads: int | None,
     progress: Callable[[int], None],
 ) -> Tracks:
     """Locate corners in all images that have a picture.
@@ -96,6 +98,7 @@ def match_patches(
         views: all images, with their poses and masks.
         frames: int32 [n] their frames.
         pictures: grey pictures of the images, which may be downscaled.
+        num_threads: number of threads; None: one per CPU. The result does not depend on it.
         progress: called with the number of images so far.
 
     Returns:
@@ -110,16 +113,21 @@ def match_patches(
     bounds = np.searchsorted(image[by_image], np.arange(len(views) + 1))
     patches = _cut(points, middle, image, xy, views=views, pictures=pictures)
     found = [(np.arange(len(points.xyz)), image[middle], xy[middle])]
-    for number in range(len(views)):
+
+    def search(number: int) -> tuple[_Indices, _Indices, _Floats]:
         followed = by_image[bounds[number] : bounds[number + 1]]
         own, at = point[followed], xy[followed]
-        if number in pictures:
-            seen, where = _found_in(number, patches, views[number], pictures, followed=own, at=at)
-            if len(seen) < _FEW:
-                left = ~np.isin(own, seen) & (patches.image[own] != number)
-                seen, where = np.append(seen, own[left]), np.append(where, at[left], axis=0)
-            found.append((seen, np.full(len(seen), number), where))
-        progress(number + 1)
+        if number not in pictures:
+            return own[:0], own[:0], at[:0]
+        seen, where = _found_in(number, patches, views[number], pictures, followed=own, at=at)
+        if len(seen) < _FEW:
+            left = ~np.isin(own, seen) & (patches.image[own] != number)
+            seen, where = np.append(seen, own[left]), np.append(where, at[left], axis=0)
+        return seen, np.full(len(seen), number), where
+
+    for matches in map_on_threads(search, range(len(views)), num_threads):
+        found.append(matches)
+        progress(len(found) - 1)
     columns = (np.concatenate(column) for column in zip(*found, strict=True))
     return _as_tracks(corners, frames, *columns)
 

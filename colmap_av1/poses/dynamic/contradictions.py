@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.triangulation import SIGMA_FLOOR, TriangulatedPoints
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.threads import map_on_threads
 
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
@@ -176,17 +177,26 @@ class Contradictions:
     Args:
         placed: the tracks.
         views: the images.
+        num_threads: number of threads; None: one per CPU. The result does not depend on it.
     """
 
-    def __init__(self, placed: PlacedTracks, views: Sequence[PosedCamera]) -> None:
-        self._placed = placed
+    def __init__(
+        self,
+        placed: PlacedTracks,
+        views: Sequence[PosedCamera],
+        *,
+        num_threads: int | None = None,
+    ) -> None:
+        self._placed, self._num_threads = placed, num_threads
         by_image = np.argsort(placed.image, kind="stable")
         bounds = np.searchsorted(placed.image[by_image], np.arange(len(views) + 1))
         self._seen = [by_image[a:b] for a, b in itertools.pairwise(bounds)]
         there = np.flatnonzero(np.isfinite(placed.xyz[:, 0]))
-        self._shown = [
-            self._show(view, there, rows) for view, rows in zip(views, self._seen, strict=True)
-        ]
+
+        def show(index: int) -> _Shown:
+            return self._show(views[index], there, self._seen[index])
+
+        self._shown = list(map_on_threads(show, range(len(views)), num_threads))
 
     @property
     def by_motion(self) -> _Bools:
@@ -250,7 +260,10 @@ class Contradictions:
         placed = self._placed
         _, rows, columns = placed.shape
         hides, looked = np.zeros(len(agreeing)), np.zeros(len(agreeing))
-        for seen, shown in zip(self._seen, self._shown, strict=True):
+
+        def look(image: int) -> tuple[NDArray[np.int32], _Bools]:
+            """The tracks with enough points around them, and whether they would hide these."""
+            seen, shown = self._seen[image], self._shown[image]
             own = seen[agreeing[placed.track[seen]]]
             at = placed.row[own] * columns + placed.column[own]
             in_cells = np.full(rows * columns, np.inf)
@@ -260,10 +273,12 @@ class Contradictions:
             count = uniform_filter(counts.reshape(rows, columns), _AROUND, mode="constant")
             count *= _AROUND**2
             enough = count[shown.row, shown.column] > _MIN_POINTS_BEHIND - 0.5
-            track = shown.track[enough]
-            looked[track] += 1
             before = shown.depth * _HIDES < nearest[shown.row, shown.column]
-            hides[track] += before[enough]
+            return shown.track[enough], before[enough]
+
+        for track, before in map_on_threads(look, range(len(self._seen)), self._num_threads):
+            looked[track] += 1
+            hides[track] += before
         return (hides > _HIDDEN_SHARE * looked) & (looked >= _MIN_IMAGES)
 
     def _seen_through(self, agreeing: _Bools) -> _Bools:
@@ -277,7 +292,10 @@ class Contradictions:
             return np.asarray(np.clip(np.nan_to_num(found), 0, _NUM_STEPS - 1), np.int64)
 
         through = np.zeros(len(agreeing))
-        for rows, shown in zip(self._seen, self._shown, strict=True):
+
+        def look(image: int) -> tuple[_Ints, _Bools]:
+            """The tracks with points, and whether they are seen through a surface."""
+            rows, shown = self._seen[image], self._shown[image]
             own = rows[np.isfinite(placed.depth[rows])]
             kept = agreeing[shown.track]
             proof = own[agreeing[placed.track[own]]]
@@ -288,8 +306,11 @@ class Contradictions:
                 placed.row[proof], placed.column[proof], steps(placed.depth[proof]), at
             )
             is_through = (there >= _MIN_BEFORE) & (seen == 0) & (step >= 0)
+            return placed.track[own], np.asarray(is_through)
+
+        for track, is_through in map_on_threads(look, range(len(self._seen)), self._num_threads):
             # `+=` suffices: a track has one observation per image.
-            through[placed.track[own]] += is_through
+            through[track] += is_through
         return np.asarray(through > _THROUGH_SHARE * placed.lengths)
 
     def _at_most(

@@ -45,17 +45,20 @@ _PASSES = 2
 _CLOSED = 3
 
 
-def dynamic_cells(placed: PlacedTracks, views: Sequence[PosedCamera]) -> _Bools:
+def dynamic_cells(
+    placed: PlacedTracks, views: Sequence[PosedCamera], *, num_threads: int | None = None
+) -> _Bools:
     """Find the dynamic cells of images.
 
     Args:
         placed: tracks of a video in its images, about one per cell.
         views: the images, in temporal order.
+        num_threads: number of threads; None: one per CPU. The result does not depend on it.
 
     Returns:
         Bool [images, rows, columns] the dynamic cells, dilated by one.
     """
-    found = Contradictions(placed, views)
+    found = Contradictions(placed, views, num_threads=num_threads)
     by_motion, surely = found.by_motion, found.surely_by_motion
     moving = np.zeros(len(by_motion), np.bool_)
     cells = np.zeros(placed.shape, np.bool_)

@@ -118,6 +118,7 @@ def _dynamic_masks(
     run: Run, tracks: Tracks, placed: PosedImages, own: NDArray[np.intp]
 ) -> dict[str, Mask]:
     """Masks that exclude dynamic pixels from the images of a video, by image name."""
+    num_threads = run.options.match.run.num_threads
     images = [placed.images[i] for i in own]
     views = views_of(images, placed.cameras, [None] * len(own))
     size = views[0].size
@@ -146,10 +147,11 @@ def _dynamic_masks(
         [view.cam_from_world for view in views],
         None,
         options=how,
-        num_threads=run.options.match.run.num_threads,
+        num_threads=num_threads,
         progress=no_progress,
     )
-    cells = dynamic_cells(place_tracks(seen, image, points, views, cell=cell), views)
+    placed_tracks = place_tracks(seen, image, points, views, cell=cell)
+    cells = dynamic_cells(placed_tracks, views, num_threads=num_threads)
     return {
         own_image.name: mask_of_cells(moving, cell, size)
         for own_image, moving in zip(images, cells, strict=True)
