@@ -254,8 +254,11 @@ def match(
             written = demote_failing_starts(
                 written, names, found.cameras, context, meets_first_limits=has_start
             )
-        except ModelError as error:
-            crash = f"COLMAP's mapper may fail on this database: {error}"
+        except ModelError:
+            crash = (
+                "COLMAP's mapper failed in a trial on this database, and may fail again: if so, "
+                "its output tells why"
+            )
         num_written, blurred = 0, list[str]()
         if folder is not None:
             check_videos()

@@ -118,7 +118,7 @@ def choose_images(
     if len(chosen.frames) < 2:
         raise ImageError(
             f"{len(chosen.frames)} of {tracks.num_frames} frames become images: matches need two "
-            f"or more{': give a longer video' if tracks.num_frames < 2 else ''}"
+            f"or more: {'give a longer video' if tracks.num_frames < 2 else 'choose more frames'}"
         )
     return chosen
 

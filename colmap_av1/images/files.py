@@ -369,7 +369,9 @@ def read_image(path: Path) -> _Image:
             error
         )
     except OSError as error:
-        raise ImageError(f"{path}: cannot be read: {error.strerror}") from error
+        raise ImageError(
+            f"{path}: cannot be read: {error.strerror}: fix that, or give other images"
+        ) from error
     if image is None:
         raise ImageError(f"{path}: is missing or not an image: give the folder of the images")
     return np.asarray(image, dtype=np.uint8)
