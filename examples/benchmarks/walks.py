@@ -6,7 +6,8 @@ The script renders walks through three furnished rooms with plain walls, 320x240
 second. At the doors, the camera turns by 8 to 12 degrees per frame, with motion blur of half a
 frame. Each walk has its own furniture, turns and speed. True poses are known, intrinsics are not
 given. `reconstruct` runs with its defaults, and so does COLMAP's incremental mapper on the database
-of `match`. A model is bent if its camera centres have an error of more than 2 % of their extent.
+of `match`, and on SIFT features of all frames, matched sequentially. A model is bent if its camera
+centres have an error of more than 2 % of their extent.
 """
 
 from __future__ import annotations
@@ -29,9 +30,10 @@ from numpy.typing import NDArray
 from results import add_results, read_rows, save
 from sequences import model_poses
 
-from colmap_av1 import ColmapAv1Error, MatchReport, ReconstructReport, match, reconstruct
+from colmap_av1 import ColmapAv1Error, match, reconstruct
 from colmap_av1.evaluate import pose_errors
 from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.images.files import write_images
 
 Floats = NDArray[np.float64]
 
@@ -43,7 +45,7 @@ BENT = 0.02
 NUM_BLURRED = 3
 # Number of different textures. They are stacked, and cv2.remap accepts at most 32767 rows.
 NUM_FACES = 60
-WAYS = ("reconstruct", "match, mapper")
+SIFT, RECONSTRUCT, MATCH = WAYS = ("SIFT sequential, mapper", "reconstruct", "match, mapper")
 PLAIN = 3.0  # standard deviation of plain walls in grey levels
 
 
@@ -57,7 +59,7 @@ class Row:
         images: number of chosen images.
         registered: number of registered images of each model, in the order of their folders.
         errors: error of the camera centres of each model, as a share of their extent.
-        warnings: warnings of `reconstruct` or `match`.
+        warnings: warnings of `reconstruct` or `match`; none with SIFT.
     """
 
     walk: str
@@ -92,34 +94,42 @@ def main() -> int:
 
 def measure(video: Path, seed: int, way: str) -> Row:
     """Make the models of a walk."""
-    output = video.parent / ("output" if way == WAYS[0] else "mapped")
+    output = video.parent / {SIFT: "sift", RECONSTRUCT: "output", MATCH: "mapped"}[way]
     shutil.rmtree(output, ignore_errors=True)
-    report: ReconstructReport | MatchReport
+    truth = walk(seed)
+    num_images, warnings = len(truth), tuple[str, ...]()
     try:
-        if way == WAYS[0]:
+        if way == RECONSTRUCT:
             report = reconstruct(video, output)
+            num_images, warnings = report.num_images, report.warnings
             folders = [output, *(model.output for model in report.other_models)]
             made = [read_model(own / "sparse" / "0") for own in folders]
         else:
             output.mkdir()
-            report = match(output / "walk.db", video, image_path=output / "images")
+            database, images = output / "walk.db", output / "images"
+            if way == MATCH:
+                matched = match(database, video, image_path=images)
+                num_images, warnings = matched.num_images, matched.warnings
+            else:
+                frames = range(len(truth))
+                write_images(video, images, [f"{frame:06d}.png" for frame in frames], frames)
+                one = pycolmap.CameraMode.SINGLE
+                pycolmap.extract_features(database, images, camera_mode=one)
+                pycolmap.match_sequential(database)
             (output / "models").mkdir()
-            found = pycolmap.incremental_mapping(
-                report.database, output / "images", output / "models"
-            )
+            found = pycolmap.incremental_mapping(database, images, output / "models")
             made = [found[number] for number in sorted(found)]
     except ColmapAv1Error as error:
         return Row(str(seed), way, 0, "", "", str(error))
-    truth = walk(seed)
     models = [model_poses(own, len(truth)) for own in made]
     errors = [pose_errors(own, truth) for own in models]
     return Row(
         str(seed),
         way,
-        report.num_images,
+        num_images,
         " + ".join(str(int(np.isfinite(own[:, 0, 0]).sum())) for own in models),
         " + ".join("-" if own is None else f"{own.ate / own.extent:.2%}" for own in errors),
-        "; ".join(report.warnings),
+        "; ".join(warnings),
     )
 
 
