@@ -24,8 +24,11 @@ _Floats = NDArray[np.float64]
 
 # Fewest iterations of a robust estimator; it runs more if few matches are inliers.
 _MIN_ITERATIONS = 15
-# COLMAP limits the number of iterations to what this inlier ratio needs.
+# COLMAP limits the number of iterations to what this inlier ratio needs, times the factor.
 _MIN_INLIER_RATIO = 0.25
+_ITERATIONS_FACTOR = 3
+# Numbers of matches that determine a model.
+_POSE_SAMPLE, _FUNDAMENTAL_SAMPLE, _HOMOGRAPHY_SAMPLE = 5, 7, 4
 # Number of matches on which a model is refined, and limits of the refinement.
 MAX_REFINED = 500
 _REFINEMENT = {"max_iterations": 8, "step_tol": 1e-4, "gradient_tol": 1e-6}
@@ -110,16 +113,35 @@ class Search:
         """Number of matches in a share of the full sample."""
         return max(MIN_MATCHES, round(share * self.options.max_samples))
 
-    def ransac(self, min_iterations: int) -> dict[str, Any]:
-        """The options in PoseLib's form."""
+    def ransac(self, sample_size: int, inlier_ratio: float) -> dict[str, Any]:
+        """The options in PoseLib's form.
+
+        Args:
+            sample_size: number of matches that determine the model.
+            inlier_ratio: smallest inlier ratio of a model that is of use. It limits the number of
+                iterations, which pairs without any model would else exhaust.
+        """
+        options = self.options
+        clean = min(1.0, max(inlier_ratio, _MIN_INLIER_RATIO)) ** sample_size
+        if options.confidence >= 1:
+            wanted = options.max_iterations
+        elif clean >= 1:
+            wanted = _MIN_ITERATIONS
+        else:
+            trials = math.log(1 - options.confidence) / math.log(1 - clean)
+            wanted = max(_MIN_ITERATIONS, math.ceil(_ITERATIONS_FACTOR * trials))
         return {
-            "max_epipolar_error": self.options.max_error,
-            "max_reproj_error": self.options.max_error,
-            "max_iterations": self.options.max_iterations,
-            "min_iterations": min(min_iterations, self.options.max_iterations),
-            "success_prob": self.options.confidence,
+            "max_epipolar_error": options.max_error,
+            "max_reproj_error": options.max_error,
+            "max_iterations": min(wanted, options.max_iterations),
+            "min_iterations": min(_MIN_ITERATIONS, options.max_iterations),
+            "success_prob": options.confidence,
             "seed": self.seed,
         }
+
+    def least_share(self, points: MatchedPoints) -> float:
+        """Share of the matches that must be inliers of the model of a pair."""
+        return self.options.min_num_inliers / len(points.a[0])
 
 
 def find_pose(points: MatchedPoints, search: Search, focal_lengths: tuple[float, float]) -> Model:
@@ -142,9 +164,8 @@ def find_pose(points: MatchedPoints, search: Search, focal_lengths: tuple[float,
 
     # A part of the sample is enough, because the result is refined on more matches.
     xa, xb = points.first(search.part(0.5))
-    pose, _ = poselib.estimate_relative_pose(
-        xa.T, xb.T, *cameras, search.ransac(_MIN_ITERATIONS), {"max_iterations": 0}
-    )
+    ransac = search.ransac(_POSE_SAMPLE, search.least_share(points))
+    pose, _ = poselib.estimate_relative_pose(xa.T, xb.T, *cameras, ransac, {"max_iterations": 0})
     found = refine(pose, points.spread_a, points.spread_b)
     return _again_on_inliers(refine, found, found.pose, points, search)
 
@@ -163,9 +184,8 @@ def find_fundamental(points: MatchedPoints, search: Search) -> Model:
     if quick.count >= _TRUSTED_SHARE * points.a.shape[1]:
         return quick
     xa, xb = points.first(search.part(0.75))
-    F, _ = poselib.estimate_fundamental(
-        xa.T, xb.T, search.ransac(_MIN_ITERATIONS), {"max_iterations": 0}
-    )
+    ransac = search.ransac(_FUNDAMENTAL_SAMPLE, search.least_share(points))
+    F, _ = poselib.estimate_fundamental(xa.T, xb.T, ransac, {"max_iterations": 0})
     found = _test(epipolar_inliers, F, points, search)
     found = _again_on_inliers(refine, found, found.matrix, points, search)
     return min(found, quick, key=lambda model: _epipolar_loss(model, points))
@@ -200,8 +220,7 @@ def find_homography(points: MatchedPoints, search: Search, num_rival: int) -> Mo
     decisive = planar_share(search.options) * num_rival / num_matches
     if not -_RANSAC_GAIN < found.count / num_matches - decisive < _RANSAC_LOSS:
         return found
-    ransac = search.ransac(_MIN_ITERATIONS)
-    ransac["max_iterations"] = _num_iterations(decisive, search.options)
+    ransac = search.ransac(_HOMOGRAPHY_SAMPLE, decisive)
     H, _ = poselib.estimate_homography(xa.T, xb.T, ransac, _REFINEMENT)
     return _test(transfer_inliers, H, points, search)
 
@@ -286,19 +305,6 @@ def _homogeneous(x: _Floats) -> _Floats:
     extended = np.ones((3, x.shape[1]))
     extended[:2] = x
     return extended
-
-
-def _num_iterations(inlier_ratio: float, options: VerifyOptions) -> int:
-    """Number of RANSAC iterations to find a homography with this inlier ratio.
-
-    COLMAP uses the same number, so close cases are decided alike.
-    """
-    clean = max(inlier_ratio, _MIN_INLIER_RATIO) ** 4
-    if clean >= 1 or options.confidence >= 1:
-        wanted = options.max_iterations if options.confidence >= 1 else 1
-    else:
-        wanted = math.ceil(3 * math.log(1 - options.confidence) / math.log(1 - clean))
-    return min(max(wanted, _MIN_ITERATIONS), options.max_iterations)
 
 
 def _affine_fit(xa: _Floats, xb: _Floats) -> _Floats:

@@ -176,6 +176,22 @@ def test_outliers_are_rejected() -> None:
         assert len(kept - true) <= 0.25 * len(m), (i, j)
 
 
+def test_pairs_with_just_enough_inliers_are_found() -> None:
+    keypoints, pairs, matches = prepare(make_scene(noise=0.2))
+    options, rng = VerifyOptions(min_num_inliers=20), np.random.default_rng(0)
+    num_tried = num_found = 0
+    for pair, m in zip(pairs, matches, strict=True):
+        if len(m) < 50:
+            continue
+        some = m[rng.permutation(len(m))[:28]]
+        some[22:, 1] = rng.permutation(m[:, 1])[:6]
+        for seed in range(5):
+            (found,) = verify_pairs(keypoints, pair[None], [some], KNOWN, options, seed=seed)
+            num_tried, num_found = num_tried + 1, num_found + (len(found.inlier_matches) >= 20)
+    assert num_tried > 100
+    assert num_found >= 0.99 * num_tried
+
+
 def test_result_depends_on_the_seed_but_not_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verify, "_PAIRS_FOR_A_THREAD", 10)
     keypoints, pairs, matches = prepare(make_scene(num_points=2500), outliers=0.2)
