@@ -68,6 +68,8 @@ class Posed:
         has_picture_positions: whether tracks have positions in the pictures; false if they were
             corrected for a rolling shutter.
         far_views: the long-range check; None if it was not made.
+        rival: the adjustment of other poses that fit the observations about as well; None if there
+            are none.
     """
 
     matches: Kept[MatchesResult]
@@ -80,6 +82,7 @@ class Posed:
     moving: dict[str, Mask]
     has_picture_positions: bool
     far_views: Kept[LongRangeResult] | None = None
+    rival: Kept[AdjustedResult] | None = None
 
     @property
     def last(self) -> Kept[PosesResult]:
@@ -242,7 +245,15 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
         seams = sorted({*seams, *adjusted.turns})
         if not seams:
             break
-        parts = split_stage(run, image_set, posed.mapped, posed.adjustment, seams, number=number)
+        parts = split_stage(
+            run,
+            image_set,
+            posed.mapped,
+            posed.adjustment,
+            seams,
+            rival=posed.rival,
+            number=number,
+        )
         if parts.result.num_registered == adjusted.num_registered:
             break
         frame_of = image_set.images.frame_of
@@ -382,7 +393,8 @@ def remapped_poses(run: Run, posed: Posed, image_set: ImageSet, *, least_kept: f
     again = remap_stage(run, image_set, posed.mapped, posed.adjustment)
     if not again.result.fits(least_kept):
         return posed
-    posed = replace(posed, mapped=again)
+    rival = None if again.result.is_clearly_better else posed.adjustment
+    posed = replace(posed, mapped=again, rival=rival)
     return replace(posed, adjustment=_adjusted(run, posed, image_set, again, number=2))
 
 

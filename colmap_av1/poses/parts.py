@@ -5,11 +5,15 @@ undetermined; if no points carry the scale across, it leaves their relative scal
 Such a model is bent, although each side is correct. The sides become separate models, as with
 COLMAP's mapper where it cannot connect images. They stay together if both see the same places with
 parallax, which determines their relative scale.
+
+A wrong pose may feign parallax: while a camera turns, a sideways motion looks much like a rotation.
+If the images were mapped twice and both results fit the observations equally well, the places must
+have parallax in both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
@@ -46,6 +50,7 @@ def split_stage(
     adjusted: Kept[AdjustedResult],
     seams: Sequence[tuple[str, str]],
     *,
+    rival: Kept[AdjustedResult] | None,
     number: int,
 ) -> Kept[MappedResult]:
     """Split an adjusted model at its seams.
@@ -56,6 +61,7 @@ def split_stage(
         mapped: the models of the mapper.
         adjusted: the first of these, adjusted.
         seams: names of the images before and after each seam where it may be split.
+        rival: see `Posed`.
         number: number of the next adjustment.
 
     Returns:
@@ -66,7 +72,8 @@ def split_stage(
 
     def make(partial: Path) -> MappedResult:
         known = read_posed_model(run.stages / adjusted.result.poses)
-        parts = parts_of(known, image_set, seams)
+        other = read_posed_model(run.stages / rival.result.poses) if rival is not None else None
+        parts = parts_of(known, image_set, seams, rival=other)
         (partial / name).mkdir()
         files = [f"{name}/{part}.npz" for part in range(len(parts))]
         for file, names in zip(files, parts, strict=True):
@@ -83,7 +90,7 @@ def split_stage(
     return run_stage(
         run.stages,
         name,
-        [mapped.digest, adjusted.digest, list(seams)],
+        [mapped.digest, adjusted.digest, list(seams), rival.digest if rival is not None else None],
         MappedResult,
         into=run.stages,
         products=[name],
@@ -92,7 +99,11 @@ def split_stage(
 
 
 def parts_of(
-    model: PosedModel, image_set: ImageSet, seams: Sequence[tuple[str, str]]
+    model: PosedModel,
+    image_set: ImageSet,
+    seams: Sequence[tuple[str, str]],
+    *,
+    rival: PosedModel | None = None,
 ) -> list[AbstractSet[str]]:
     """The names of the images of each part of a model, the largest part first.
 
@@ -104,26 +115,48 @@ def parts_of(
         model: the model with its points.
         image_set: all images.
         seams: names of the images before and after each seam.
+        rival: other poses of its images, with points, that fit the observations as well.
     """
     names = image_set.images.names
     sequence = image_set.sequence
     is_seam = np.isin(names, [first for first, _ in seams])
     starts = np.append(True, is_seam[:-1] | (np.diff(sequence) != 0))
     sequence_of = sequence[starts]
-    index = {name: i for i, name in enumerate(names)}
-    place = np.array([index[image.name] for image in model.images])
-    of_image = (np.cumsum(starts) - 1)[place]
-    point, stretch, has_depth = _seen_in_stretches(model, of_image)
-    shape = (len(model.points.xyz), len(sequence_of))
-    common = _common(point, stretch, shape)
-    scaled = _common(point[has_depth], stretch[has_depth], shape)
+    stretch_of = dict(zip(names, (np.cumsum(starts) - 1).tolist(), strict=True))
+    common, scaled = _common_points(model, stretch_of, len(sequence_of))
+    if rival is not None:
+        scaled = np.minimum(scaled, _common_points(rival, stretch_of, len(sequence_of))[1])
     is_same = np.equal.outer(sequence_of, sequence_of)
     is_connected = np.where(is_same, scaled >= _WITHIN_VIDEO, common >= _BETWEEN_VIDEOS)
-    component = connected_components(len(sequence_of), np.argwhere(is_connected))[of_image]
     registered = np.array([image.name for image in model.images])
+    of_image = np.array([stretch_of[name] for name in registered.tolist()])
+    component = connected_components(len(sequence_of), np.argwhere(is_connected))[of_image]
     parts = [set(registered[component == number].tolist()) for number in np.unique(component)]
     parts.sort(key=lambda part: -len(part))
     return [parts[0], *(part for part in parts[1:] if len(part) >= FEWEST_IMAGES)]
+
+
+def _common_points(
+    model: PosedModel, stretch_of: Mapping[str, int], num_stretches: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The number of points that every two stretches have in common.
+
+    Args:
+        model: the model with its points.
+        stretch_of: stretch of each image, by name.
+        num_stretches: number of stretches.
+
+    Returns:
+        int64 [num_stretches, num_stretches] all of these points, and those that have depth in each
+        stretch.
+    """
+    of_image = np.array([stretch_of[image.name] for image in model.images])
+    point, stretch, has_depth = _seen_in_stretches(model, of_image)
+    shape = (len(model.points.xyz), num_stretches)
+    return (
+        _common(point, stretch, shape),
+        _common(point[has_depth], stretch[has_depth], shape),
+    )
 
 
 def _seen_in_stretches(

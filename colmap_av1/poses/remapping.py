@@ -54,6 +54,8 @@ _LEAST_REGISTERED = 0.5
 # 0.01 to 0.9 of the first on 17 of them; on the other it rose from 0.2 to 0.3 % of the extent. On
 # one walk the ratio was 1.007, and the error rose from 0.6 to 9.6 %.
 _MAX_COST_RATIO = 1.002
+# Above this ratio, the observations do not tell which of the two is right.
+_CLEAR_RATIO = 0.99
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,11 @@ class RemappedResult(MappedResult):
         """
         is_whole = self.share >= _LEAST_REGISTERED and self.kept >= least_kept
         return is_whole and self.new_cost <= _MAX_COST_RATIO * self.cost
+
+    @property
+    def is_clearly_better(self) -> bool:
+        """Whether it fits the observations clearly better than the first."""
+        return self.new_cost <= _CLEAR_RATIO * self.cost
 
 
 def remap_stage(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
@@ -71,6 +72,17 @@ def test_points_without_parallax_on_either_side_do_not_join_parts() -> None:
     for views in ([12, 13], [11, 12, 13], [0, 29]):
         known = model(image_set, [*own, *[views] * 1000])
         assert len(parts_of(known, image_set, [seam(image_set, 12)])) == 2
+
+
+def test_parallax_in_one_of_two_equally_good_models_does_not_join_parts() -> None:
+    image_set, seams = images(30), [seam(images(30), 12)]
+    known = model(image_set, [*stretch(0, 12), *stretch(13, 29), *[[11, 12, 13, 14]] * 200])
+    still = [
+        replace(image, cam_from_world=known.images[0].cam_from_world) if number < 13 else image
+        for number, image in enumerate(known.images)
+    ]
+    for rival, count in ((None, 1), (known, 1), (replace(known, images=still), 2)):
+        assert len(parts_of(known, image_set, seams, rival=rival)) == count
 
 
 def test_a_stretch_without_parallax_joins_no_parts() -> None:
