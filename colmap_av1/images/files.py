@@ -251,7 +251,8 @@ def write_images(
         operating_point: operating point of a scalable stream.
         change: called on several threads with (display_index, picture) of each missing image;
             returns the picture to write.
-        look: called with (display_index, written picture) of each missing image, in display order.
+        look: called on this thread with (display_index, written picture) of each missing image, in
+            display order.
         display: how pictures are cropped and rotated; None: as players do.
         kept: store of decoded pictures, which are not decoded again.
         progress: called with the number of images done so far.
@@ -278,11 +279,11 @@ def write_images(
         if progress is not None:
             progress(num_kept + num_written)
 
-    def write(shown: tuple[int, _Image]) -> tuple[int, _Image]:
+    def write(shown: tuple[int, _Image]) -> tuple[int, _Image | None]:
         index, picture = shown
         picture = change(index, picture) if change is not None else picture
         write_image(wanted[index], picture)
-        return index, picture
+        return index, picture if look is not None else None
 
     report(0)
     if not wanted:
@@ -308,12 +309,24 @@ def write_images(
                 wanted=wanted,
                 kept=kept,
             )
-            with contextlib.closing(decoded):
-                written = map_on_threads(write, _pictures(decoded, wanted), num_threads)
-                for done, (index, picture) in enumerate(written, start=1):
-                    if look is not None:
+            done = 0
+            with (
+                contextlib.closing(decoded),
+                contextlib.closing(
+                    map_on_threads(write, _pictures(decoded, wanted), num_threads)
+                ) as written,
+            ):
+                for index, picture in written:
+                    done += 1
+                    if look is not None and picture is not None:
                         look(index, picture)
                     report(done)
+            if done < len(wanted):
+                raise ImageError(
+                    f"the decoder returns no frame {sorted(wanted)[done]} of the "
+                    f"{max(wanted) + 1} that the stream shows: leave out the images, or re-encode "
+                    "the video"
+                )
     except VideoError:  # a later run would mix these images with those of the new video
         for path in wanted.values():
             path.unlink(missing_ok=True)
@@ -329,7 +342,7 @@ def _pictures(
 ) -> Iterator[tuple[int, _Image]]:
     """Yield the wanted ones of decoded frames, which must have one size."""
     size: tuple[int, ...] | None = None
-    left = set(wanted)
+    last = max(wanted)
     for index, picture in decoded:
         size = size or picture.shape
         if picture.shape != size:
@@ -338,15 +351,10 @@ def _pictures(
                 f"{size[1]}x{size[0]}: images of one camera cannot change their size; "
                 "re-encode the video at one size"
             )
-        if index in left:
-            left.remove(index)
+        if index in wanted:
             yield index, picture
-        if not left:
+        if index >= last:
             return
-    raise ImageError(
-        f"the decoder returns no frame {min(left)} of the {max(wanted) + 1} that the stream "
-        "shows: leave out the images, or re-encode the video"
-    )
 
 
 def read_image(path: Path) -> _Image:

@@ -119,7 +119,7 @@ class Search:
         Args:
             sample_size: number of matches that determine the model.
             inlier_ratio: smallest inlier ratio of a model that is of use. It limits the number of
-                iterations, which pairs without any model would else exhaust.
+                iterations: pairs without a model would otherwise run all of them.
         """
         options = self.options
         clean = min(1.0, max(inlier_ratio, _MIN_INLIER_RATIO)) ** sample_size
@@ -140,8 +140,8 @@ class Search:
         }
 
     def least_share(self, points: MatchedPoints) -> float:
-        """Share of the matches that must be inliers of the model of a pair."""
-        return self.options.min_num_inliers / len(points.a[0])
+        """Smallest share of inliers with which a pair is accepted."""
+        return self.options.min_num_inliers / int(points.a.shape[1])
 
 
 def find_pose(points: MatchedPoints, search: Search, focal_lengths: tuple[float, float]) -> Model:

@@ -68,8 +68,8 @@ class Posed:
         has_picture_positions: whether tracks have positions in the pictures; false if they were
             corrected for a rolling shutter.
         far_views: the long-range check; None if it was not made.
-        rival: the adjustment of other poses that fit the observations about as well; None if there
-            are none.
+        rival: the adjustment of the first mapping if a second one replaced it, but fits the
+            observations hardly better; else None.
     """
 
     matches: Kept[MatchesResult]

@@ -153,7 +153,7 @@ class LongRangeCheck:
             features,
             self._cameras,
             VerifyOptions(),
-            RunContext(),
+            RunContext(num_threads=1),
         )
         names, errors = [], []
         for (i, j), geometry in zip(found.pairs.tolist(), found.geometries, strict=True):

@@ -6,21 +6,22 @@ Such a model is bent, although each side is correct. The sides become separate m
 COLMAP's mapper where it cannot connect images. They stay together if both see the same places with
 parallax, which determines their relative scale.
 
-A wrong pose may feign parallax: while a camera turns, a sideways motion looks much like a rotation.
-If the images were mapped twice and both results fit the observations equally well, the places must
-have parallax in both.
+With wrong poses, points may seem to have parallax: while a camera turns, a motion to the side looks
+much like a rotation. If the images were mapped twice, and the second result fits the observations
+hardly better than the first, the places must have parallax in both.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.colmap_model import camera_centres
+from colmap_av1.geometry.colmap_model import camera_centres, keep_observations
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.pose_stages import AdjustedResult, MappedResult
@@ -115,7 +116,8 @@ def parts_of(
         model: the model with its points.
         image_set: all images.
         seams: names of the images before and after each seam.
-        rival: other poses of its images, with points, that fit the observations as well.
+        rival: other poses of its images, and maybe of others, with points, that fit the
+            observations about as well.
     """
     names = image_set.images.names
     sequence = image_set.sequence
@@ -125,6 +127,10 @@ def parts_of(
     stretch_of = dict(zip(names, (np.cumsum(starts) - 1).tolist(), strict=True))
     common, scaled = _common_points(model, stretch_of, len(sequence_of))
     if rival is not None:
+        own = model.by_name
+        shown = np.array([image.name in own for image in rival.images])
+        points, _ = keep_observations(rival.points, shown[rival.points.image])
+        rival = replace(rival, points=points)
         scaled = np.minimum(scaled, _common_points(rival, stretch_of, len(sequence_of))[1])
     is_same = np.equal.outer(sequence_of, sequence_of)
     is_connected = np.where(is_same, scaled >= _WITHIN_VIDEO, common >= _BETWEEN_VIDEOS)

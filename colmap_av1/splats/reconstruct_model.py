@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import shutil
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -98,7 +99,13 @@ def _undistortions(placed: PosedImages, cameras: Mapping[int, pycolmap.Camera]) 
     def of_camera(camera_id: int) -> Undistortion | None:
         return undistortion(placed.cameras[camera_id], cameras[camera_id])
 
-    return lambda index: of_camera(placed.images[index].camera_id)
+    one_at_a_time = threading.Lock()  # else each thread would create the same map
+
+    def of_image(index: int) -> Undistortion | None:
+        with one_at_a_time:
+            return of_camera(placed.images[index].camera_id)
+
+    return of_image
 
 
 def _undistorted(picture: _Image, how: Undistortion | None) -> _Image:

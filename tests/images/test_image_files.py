@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import Encode, encode_two_sizes
+from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.images.files import (
@@ -201,8 +203,44 @@ def test_unusable_image_folders_are_refused(tmp_path: Path) -> None:
 
 
 def test_missing_frames_are_an_error(clip: Path, tmp_path: Path) -> None:
+    names = [f"{frame}.png" for frame in range(17)]
     with pytest.raises(ImageError, match="16"):
-        write_images(clip, tmp_path, ["a.png"], [16])
+        write_images(clip, tmp_path, names, range(17))
+    assert {path.name for path in tmp_path.iterdir()} == set(names[:16])
+
+
+def test_changed_pictures_are_written_and_shown_in_order(clip: Path, tmp_path: Path) -> None:
+    names = [f"{frame}.png" for frame in range(16)]
+    seen: list[int] = []
+
+    def look(frame: int, picture: NDArray[np.uint8]) -> None:
+        seen.append(frame)
+        assert (picture == frame).all()
+        assert (cv2.imread(str(tmp_path / names[frame])) == frame).all()
+
+    write_images(
+        clip,
+        tmp_path,
+        names,
+        range(16),
+        num_threads=3,
+        change=lambda frame, picture: np.full_like(picture, frame),
+        look=look,
+    )
+    assert seen == list(range(16))
+
+
+def test_no_image_is_written_after_an_error_of_the_caller(clip: Path, tmp_path: Path) -> None:
+    def stop(frame: int, _: NDArray[np.uint8]) -> None:
+        raise KeyboardInterrupt
+
+    names = [f"{frame}.png" for frame in range(16)]
+    with pytest.raises(KeyboardInterrupt):
+        write_images(clip, tmp_path, names, range(16), num_threads=2, look=stop)
+    written = sorted(tmp_path.iterdir())
+    time.sleep(0.2)
+    assert sorted(tmp_path.iterdir()) == written
+    assert len(written) < 16
 
 
 @contextmanager

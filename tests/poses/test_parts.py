@@ -13,7 +13,12 @@ from image_sets import images
 from sequences import model_poses
 
 from colmap_av1.evaluate import pose_errors
-from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, read_model
+from colmap_av1.geometry.colmap_model import (
+    ModelImage,
+    ModelPoints,
+    keep_observations,
+    read_model,
+)
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.parts import parts_of
@@ -83,6 +88,19 @@ def test_parallax_in_one_of_two_equally_good_models_does_not_join_parts() -> Non
     ]
     for rival, count in ((None, 1), (known, 1), (replace(known, images=still), 2)):
         assert len(parts_of(known, image_set, seams, rival=rival)) == count
+
+
+def test_only_images_of_the_model_give_its_rival_parallax() -> None:
+    image_set, seams, used = images(30), [seam(images(30), 14)], range(4, 30)
+    own = [*stretch(4, 14), *stretch(15, 29)]
+    whole = model(image_set, [*own, *[[13, 14, 15, 16]] * 200])
+    points, _ = keep_observations(whole.points, np.isin(whole.points.image, used))
+    points = replace(points, image=points.image - used.start)
+    part = PosedModel(whole.cameras, [whole.images[i] for i in used], points)
+    rival = model(image_set, [*own, *[[0, 14, 15, 16]] * 200])
+    assert len(parts_of(whole, image_set, seams, rival=rival)) == 1
+    assert len(parts_of(part, image_set, seams)) == 1
+    assert len(parts_of(part, image_set, seams, rival=rival)) == 2
 
 
 def test_a_stretch_without_parallax_joins_no_parts() -> None:

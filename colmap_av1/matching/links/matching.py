@@ -26,6 +26,7 @@ from colmap_av1.matching.two_view_geometry import TwoViewGeometry
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import LinkOptions, VerifyOptions
 from colmap_av1.util.cpus import one_blas_thread
+from colmap_av1.util.memory import usable_memory
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.threads import map_on_threads
 
@@ -34,6 +35,8 @@ _MAX_EXHAUSTIVE_PAIRS = 200
 # An image that is linked to another video is also matched with this many neighbours, which gives
 # its features depth.
 _NEIGHBOURS = 2
+# Bytes that one extraction needs at most, with the pictures that wait for it.
+_EXTRACTION_MEMORY = 1 << 29
 # Distance between videos in the order that `supported_links` uses; larger than `_SUPPORT_REACH`.
 _VIDEO_OFFSET = 100
 # Fewest inliers across a gap. A loop closure needs more, because nothing else confirms it.
@@ -84,7 +87,8 @@ def features_of_images(
         scale = np.array([width / picture.shape[1], height / picture.shape[0]], np.float32)
         return image, replace(features, xy=features.xy * scale)
 
-    for image, features in map_on_threads(features_of, pictures(wanted), context.num_threads):
+    num_threads = max(1, min(context.num_threads, usable_memory() // 2 // _EXTRACTION_MEMORY))
+    for image, features in map_on_threads(features_of, pictures(wanted), num_threads):
         found[image] = features
         context.progress("links", len(found), len(wanted))
     return found

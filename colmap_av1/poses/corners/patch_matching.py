@@ -125,9 +125,10 @@ def match_patches(
             seen, where = np.append(seen, own[left]), np.append(where, at[left], axis=0)
         return seen, np.full(len(seen), number), where
 
-    for matches in map_on_threads(search, range(len(views)), num_threads):
+    searched = map_on_threads(search, range(len(views)), num_threads)
+    for done, matches in enumerate(searched, start=1):
         found.append(matches)
-        progress(len(found) - 1)
+        progress(done)
     columns = (np.concatenate(column) for column in zip(*found, strict=True))
     return _as_tracks(corners, frames, *columns)
 

@@ -261,8 +261,8 @@ class Contradictions:
         _, rows, columns = placed.shape
         hides, looked = np.zeros(len(agreeing)), np.zeros(len(agreeing))
 
-        def look(image: int) -> tuple[NDArray[np.int32], _Bools]:
-            """The tracks with enough points around them, and whether they would hide these."""
+        def hiding_in(image: int) -> tuple[NDArray[np.int32], _Bools]:
+            """The tracks with enough points around them, and whether each would hide those."""
             seen, shown = self._seen[image], self._shown[image]
             own = seen[agreeing[placed.track[seen]]]
             at = placed.row[own] * columns + placed.column[own]
@@ -276,7 +276,7 @@ class Contradictions:
             before = shown.depth * _HIDES < nearest[shown.row, shown.column]
             return shown.track[enough], before[enough]
 
-        for track, before in map_on_threads(look, range(len(self._seen)), self._num_threads):
+        for track, before in map_on_threads(hiding_in, range(len(self._seen)), self._num_threads):
             looked[track] += 1
             hides[track] += before
         return (hides > _HIDDEN_SHARE * looked) & (looked >= _MIN_IMAGES)
@@ -293,7 +293,7 @@ class Contradictions:
 
         through = np.zeros(len(agreeing))
 
-        def look(image: int) -> tuple[_Ints, _Bools]:
+        def through_in(image: int) -> tuple[_Ints, _Bools]:
             """The tracks with points, and whether they are seen through a surface."""
             rows, shown = self._seen[image], self._shown[image]
             own = rows[np.isfinite(placed.depth[rows])]
@@ -308,7 +308,9 @@ class Contradictions:
             is_through = (there >= _MIN_BEFORE) & (seen == 0) & (step >= 0)
             return placed.track[own], np.asarray(is_through)
 
-        for track, is_through in map_on_threads(look, range(len(self._seen)), self._num_threads):
+        for track, is_through in map_on_threads(
+            through_in, range(len(self._seen)), self._num_threads
+        ):
             # `+=` suffices: a track has one observation per image.
             through[track] += is_through
         return np.asarray(through > _THROUGH_SHARE * placed.lengths)
