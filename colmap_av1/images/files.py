@@ -426,7 +426,7 @@ def _detail_by_direction(grey: _Image) -> list[float]:
     ]
 
 
-def grey_within(picture: _Image, longest: int) -> NDArray[np.uint8]:
+def grey_within(picture: _Image, longest: int) -> _Image:
     """Convert a BGR picture to grey, downscaled if its longer side exceeds `longest` pixels."""
     scale = min(1.0, longest / max(picture.shape[:2]))
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -20,7 +19,7 @@ from colmap_av1.images.files import READABLE
 from colmap_av1.images.names import natural_key, pattern_regex
 from colmap_av1.options.images import ImageOptions
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.cpus import threads_or_cpus
+from colmap_av1.util.threads import map_on_threads
 
 _SUFFIX = ".png"
 # A frame with a smaller share of unmasked pixels is treated as if it had no motion.
@@ -218,8 +217,7 @@ def read_masks(path: Path, labels: Sequence[str], num_frames: Sequence[int]) -> 
             raise ImageError(f"{path}: holds no PNG: {_LAYOUTS}")
     else:
         raise ImageError(f"{path}: no such file or folder of masks: {_LAYOUTS}")
-    with ThreadPoolExecutor(max_workers=threads_or_cpus(None)) as executor:
-        masks = list(executor.map(_read_mask, files))
+    masks = list(map_on_threads(_read_mask, files))
     if not any(mask.share for mask in masks):
         what = "the mask is" if len(masks) == 1 else f"all {len(masks)} masks are"
         raise ImageError(

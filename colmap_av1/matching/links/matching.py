@@ -179,12 +179,12 @@ def match_pairs(
     views = [ImageKeypoints(0, own, np.arange(len(own), dtype=np.int64)) for own in xy]
     there = [i in features and j in features for i, j in pairs.tolist()]
     pairs = pairs[np.array(there, dtype=np.bool_)]
+
+    def match(pair: list[int]) -> NDArray[np.uint32]:
+        return match_features(features[pair[0]], features[pair[1]])
+
     matches = []
     with one_blas_thread():
-
-        def match(pair: list[int]) -> NDArray[np.uint32]:
-            return match_features(features[pair[0]], features[pair[1]])
-
         for found in map_on_threads(match, pairs.tolist(), context.num_threads):
             matches.append(found)
             context.progress("link matches", len(matches), len(pairs))
