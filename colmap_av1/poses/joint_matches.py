@@ -33,6 +33,7 @@ from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.adjusting import focal_length_errors, refines_intrinsics
 from colmap_av1.poses.estimate import Posed, estimate_poses
 from colmap_av1.poses.further_models import further_poses
+from colmap_av1.poses.long_range_stage import LongRangeResult
 from colmap_av1.poses.pose_stages import AdjustedResult
 from colmap_av1.poses.posed_images import PosedImages, posed_images_of, triangulate_in
 from colmap_av1.poses.run import Run
@@ -137,16 +138,13 @@ def match_jointly(
         density: which motion tracks are matched.
 
     Raises:
-        ModelError: the poses of most images cannot be estimated, or the long-range check
-            contradicts them.
+        ModelError: the poses of most images cannot be estimated.
         VideoError: nothing connects any two images.
     """
     if density.max_sigma is None:
         density = replace(density, max_sigma=0.0)  # the poses show which tracks have drifted
     posed = estimate_poses(run, videos, image_set)
     far = posed.far_views.result if posed.far_views is not None else None
-    if far is not None and far.apart:
-        raise ModelError("images far apart in time contradict the poses")
     models = [_model_of(run, posed, image_set)]
     # A second mapping would join images across turns, which the mapper of the database then bends.
     further = further_poses(
@@ -181,7 +179,7 @@ def match_jointly(
         link_tracks=posed.links,
         track_lengths=paired.track_lengths,
         depth=matches.depth,
-        warnings=(*matches.link_warnings, *_warnings(models, left, model_of, image_set)),
+        warnings=(*matches.link_warnings, *_warnings(far, models, left, model_of, image_set)),
         estimate=JointEstimate(
             num_registered=tuple(len(model.placed.images) for model in models),
             far_views=far.far_views if far is not None else None,
@@ -497,6 +495,7 @@ def _focal_length(run: Run, camera: pycolmap.Camera) -> float | None:
 
 
 def _warnings(
+    far: LongRangeResult | None,
     models: Sequence[_Model],
     left: Sequence[str],
     model_of: NDArray[np.int64],
@@ -505,12 +504,15 @@ def _warnings(
     """Warnings about the estimate.
 
     Args:
+        far: result of the long-range check of the first model; None without one.
         models: the models.
         left: names of the images that are not registered.
         model_of: see `models_of_images`.
         image_set: all images.
     """
     warnings = []
+    if far is not None and far.apart and far.far_views_warning is not None:
+        warnings.append(far.far_views_warning)
     if len(models) > 1:
         parts = ", ".join(
             f"{len(images)} from '{images[0].name}' to '{images[-1].name}'"

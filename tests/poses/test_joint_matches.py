@@ -33,6 +33,7 @@ from colmap_av1.options import (
     RunOptions,
     VerifyOptions,
 )
+from colmap_av1.poses import long_range
 from colmap_av1.poses.starting_pair import starting_pair
 from colmap_av1.video.decoding import decode_frames
 
@@ -140,6 +141,18 @@ def test_requested_joint_estimate_that_fails_is_an_error(scene: Path, tmp_path: 
     with pytest.raises((ModelError, VideoError)):
         match(tmp_path / "a.db", scene, options=options)
     assert not (tmp_path / "a.db").exists()
+
+
+def test_matches_of_a_doubtful_joint_estimate_are_kept_with_a_warning(
+    joint: MatchReport, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even if images far apart in time contradict it, pairs alone give worse models."""
+    monkeypatch.setattr(long_range, "_MAX_ERROR", 0.0)
+    report = match(tmp_path / "a.db", scene, image_path=joint.image_path, options=OPTIONS)
+    assert report.estimate is not None
+    assert any("contradict" in warning for warning in report.warnings)
+    model = mapped(report.database, joint.image_path)
+    assert model.num_reg_images() == joint.num_images
 
 
 def test_same_input_gives_the_same_database(
