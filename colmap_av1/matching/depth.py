@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,13 +22,15 @@ _NUM_PAIRS = 40
 _NUM_MATCHES = 100
 LEAST_MATCHES = 30
 # A pair has parallax if this quantile of its residuals exceeds this length, in units of the longer
-# image side (0.4 to 0.5 degrees). Up to a tenth of the pairs of a hand-held zoom exceed it, because
-# zooming changes the lens distortion. More than half of the pairs of a flight over a plain exceed
-# it, and nearly all pairs of walks and drives.
+# image side (0.4 to 0.5 degrees).
 _QUANTILE, _LEAST_PARALLAX = 0.75, 8.5e-3
-# Depth is not observable if a smaller share of the pairs than the first value has parallax, and
-# unreliable if a smaller share than the second has.
-_OBSERVABLE_SHARE, _RELIABLE_SHARE = 0.25, 0.4
+# About this share of the pairs of a hand-held zoom seems to have parallax, because zooming changes
+# the lens distortion. A fifth of the pairs has parallax if somebody films a room from a few places,
+# more than half on a flight over a plain, and nearly all on walks and drives. Depth is observable
+# if more pairs than this share of them by this number of standard deviations have parallax.
+_ZOOM_SHARE, _SIGNIFICANT = 0.1, 2.0
+# Depth is unreliable if a smaller share of the pairs has parallax.
+_RELIABLE_SHARE = 0.4
 # Number of Gauss-Newton steps, and the scale of the robust loss in units of the longer image side.
 # The scale is halved after each step, down to the last value.
 _NUM_STEPS = 10
@@ -53,7 +56,9 @@ class DepthEvidence:
     @property
     def is_observable(self) -> bool:
         """Whether the matches determine depth at all; True if no pair was tested."""
-        return self.num_with_parallax >= _OBSERVABLE_SHARE * self.num_pairs
+        expected = _ZOOM_SHARE * self.num_pairs
+        deviation = math.sqrt(expected * (1 - _ZOOM_SHARE))
+        return self.num_with_parallax >= expected + _SIGNIFICANT * deviation
 
     @property
     def warning(self) -> str | None:
