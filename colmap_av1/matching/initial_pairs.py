@@ -65,6 +65,9 @@ def demote_bad_initial_pairs(
     any of them a wrong pose with a large angle, or intrinsics may diverge. With known poses, these
     pairs are demoted, too, except neighbours, which connect the images.
 
+    If a pair with a known pose meets the mapper's first limits, it needs no options for forward
+    motion: somebody who walks through a room moves forward most of the time, but not always.
+
     Args:
         matched: the images. The pose of the homography is tested only for pairs with an essential
             matrix, which needs known focal lengths.
@@ -74,7 +77,8 @@ def demote_bad_initial_pairs(
             it is not in the model. The relative pose of images in different models is not known.
 
     Returns:
-        The images with fewer inliers, and whether a pair certainly meets the mapper's first limits.
+        The images with fewer inliers, without forward motion if the mapper needs no options for it,
+        and whether a pair certainly meets the mapper's first limits.
     """
     with clock.measure("verification"):
         wrong = dict[int, float]()
@@ -111,7 +115,8 @@ def demote_bad_initial_pairs(
             bad.update(few)
         for k in bad:
             geometries[k] = demoted(geometries[k])
-    return replace(matched, geometries=geometries), has_start
+        forward = matched.forward_motion and not (known and has_start)
+    return replace(matched, geometries=geometries, forward_motion=forward), has_start
 
 
 def demoted(geometry: TwoViewGeometry) -> TwoViewGeometry:

@@ -123,7 +123,7 @@ def test_planar_pair_with_unknown_focal_length_is_kept() -> None:
 
 @pytest.mark.parametrize(
     ("turned", "forward_motion", "is_kept"),
-    [(0.0, False, True), (10.0, False, False), (10.0, True, False)],
+    [(0.0, False, True), (0.0, True, True), (10.0, False, False), (10.0, True, False)],
 )
 def test_pair_with_a_wrong_pose_is_demoted(
     turned: float, forward_motion: bool, is_kept: bool
@@ -139,6 +139,8 @@ def test_pair_with_a_wrong_pose_is_demoted(
     assert (count == len(geometry.inlier_matches)) == is_kept == meets_first_limits
     assert count >= 40
     assert is_kept or count < INITIAL_MIN_INLIERS / 2
+    # The mapper needs options for forward motion only if it has no pair to start from.
+    assert found.forward_motion == (forward_motion and not is_kept)
 
 
 def test_wrong_pair_below_the_angle_of_a_good_pair_is_kept() -> None:
