@@ -78,6 +78,17 @@ def test_depth_warning_if_the_camera_moves_only_at_the_end() -> None:
     assert found.warning is not None
 
 
+@pytest.mark.parametrize(
+    ("num_pairs", "num_with_parallax", "is_observable"),
+    [(36, 8, True), (39, 5, False), (17, 4, False), (0, 0, True)],
+)
+def test_depth_is_observable_if_more_pairs_have_parallax_than_in_a_zoom(
+    num_pairs: int, num_with_parallax: int, is_observable: bool
+) -> None:
+    """Few pairs with parallax are enough, but not if they may be chance."""
+    assert DepthEvidence(num_pairs, num_with_parallax).is_observable == is_observable
+
+
 @pytest.mark.shared
 def test_every_command_reports_that_depth_is_not_observable(
     shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
