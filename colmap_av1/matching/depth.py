@@ -27,7 +27,7 @@ _QUANTILE, _LEAST_PARALLAX = 0.75, 8.5e-3
 # About this share of the pairs of a hand-held zoom seems to have parallax, because zooming changes
 # the lens distortion. A fifth of the pairs has parallax if somebody films a room from a few places,
 # more than half on a flight over a plain, and nearly all on walks and drives. Depth is observable
-# if more pairs than this share of them by this number of standard deviations have parallax.
+# if significantly more pairs have parallax: more by this number of standard deviations.
 _ZOOM_SHARE, _SIGNIFICANT = 0.1, 2.0
 # Depth is unreliable if a smaller share of the pairs has parallax.
 _RELIABLE_SHARE = 0.4

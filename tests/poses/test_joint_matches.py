@@ -146,7 +146,7 @@ def test_requested_joint_estimate_that_fails_is_an_error(scene: Path, tmp_path: 
 def test_matches_of_a_doubtful_joint_estimate_are_kept_with_a_warning(
     joint: MatchReport, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Even if images far apart in time contradict it, pairs alone give worse models."""
+    """Images far apart in time contradict it; pairs alone would mostly give worse models."""
     monkeypatch.setattr(long_range, "_MAX_ERROR", 0.0)
     report = match(tmp_path / "a.db", scene, image_path=joint.image_path, options=OPTIONS)
     assert report.estimate is not None
