@@ -28,9 +28,12 @@ from colmap_av1.images.recognising import check_content
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.gaps import fast_frames, matching_warnings
 from colmap_av1.matching.image_matches import PairedImages
-from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
+from colmap_av1.matching.initial_pairs import prepare_start
 from colmap_av1.matching.links.report import LinkReport
-from colmap_av1.matching.mapper_limits import forward_motion_words
+from colmap_av1.matching.mapper_limits import (
+    FORWARD_MOTION,
+    SMALL_ANGLES,
+)
 from colmap_av1.matching.match_images import (
     ImageMatches,
     ImageMatchOptions,
@@ -38,7 +41,13 @@ from colmap_av1.matching.match_images import (
     match_images,
 )
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter
-from colmap_av1.options import ImageOptions, MatchOptions, PairOptions, ReconstructOptions
+from colmap_av1.options import (
+    ImageOptions,
+    MapOptions,
+    MatchOptions,
+    PairOptions,
+    ReconstructOptions,
+)
 from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.start_trials import demote_failing_starts
@@ -90,6 +99,8 @@ class MatchReport:
         forward_motion: the camera moves along its optical axis, as in a driving car: the mapper
             finds no initial pair unless its options allow this, and the focal length is not
             observable.
+        small_angles: no pair that the mapper could begin with has a large triangulation angle: it
+            begins at once, and with a correct pair, if its options allow a small one.
         links: SIFT links between images that motion does not connect.
         estimate: summary of the joint estimate of all poses that matches were verified against;
             None if they were verified pair by pair.
@@ -119,10 +130,17 @@ class MatchReport:
     num_inliers: int
     configs: dict[str, int]
     forward_motion: bool
+    small_angles: bool
     links: LinkReport
     estimate: JointEstimate | None
     seconds: dict[str, float]
     warnings: tuple[str, ...]
+
+    @property
+    def map_options(self) -> MapOptions:
+        """Options for `map_database` with which the incremental mapper starts well."""
+        angle = SMALL_ANGLES.init_min_tri_angle if self.small_angles else None
+        return MapOptions(forward_motion=self.forward_motion, init_min_tri_angle=angle)
 
     @property
     def next_commands(self) -> tuple[str, str, str]:
@@ -148,11 +166,14 @@ class MatchReport:
         ]
         if self.forward_motion:
             mapper += [
-                *forward_motion_words(),
+                *FORWARD_MOTION.words,
                 "--Mapper.ba_refine_focal_length", "0",
                 "--Mapper.ba_refine_extra_params", "0",
             ]
             ours.append("--forward_motion")
+        elif self.small_angles:
+            mapper += SMALL_ANGLES.words
+            ours += ["--init_min_tri_angle", f"{SMALL_ANGLES.init_min_tri_angle:g}"]
         densify = [
             "colmap-av1", "densify",
             "--model", f"{output}/0",
@@ -247,13 +268,12 @@ def match(
         # The poses of pairs are wrong if a focal length is a guess.
         has_focal_lengths = all(camera.has_prior_focal_length for camera in found.cameras)
         known = found.poses if isinstance(found, JointMatches) and has_focal_lengths else ()
-        written, has_start = demote_bad_initial_pairs(found.matched, found.cameras, clock, known)
+        start = prepare_start(found.matched, found.cameras, clock, known)
+        written = start.matched
         names = images.image_set.images.names
         crash = None
         try:
-            written = demote_failing_starts(
-                written, names, found.cameras, context, meets_first_limits=has_start
-            )
+            written = demote_failing_starts(start, names, found.cameras, context)
         except ModelError:
             crash = (
                 "COLMAP's mapper failed in a trial on this database, and may fail again: if so, "
@@ -312,7 +332,8 @@ def match(
         num_matches=sum(len(matches) for matches in written.matches),
         num_inliers=sum(num_inliers),
         configs=dict(sorted(kinds.items())),
-        forward_motion=written.forward_motion,
+        forward_motion=start.limits == FORWARD_MOTION,
+        small_angles=start.limits == SMALL_ANGLES,
         links=found.links,
         estimate=found.estimate if isinstance(found, JointMatches) else None,
         seconds=clock.seconds,

@@ -144,6 +144,16 @@ def test_intrinsics_are_kept_in_forward_motion(
     assert refined != given
 
 
+def test_initial_pair_has_the_given_angle(database: Path, images: Path, tmp_path: Path) -> None:
+    def relaxes(angle: float, output: Path) -> bool:
+        """Whether the mapper has to lower the limit to begin."""
+        map_database(database, images, output, options=MapOptions(init_min_tri_angle=angle))
+        return "elaxing" in (output / "mapper.log").read_text()
+
+    assert relaxes(89.0, tmp_path / "a")
+    assert not relaxes(1.0, tmp_path / "b")
+
+
 def test_bad_databases_and_folders_are_reported(
     database: Path, images: Path, tmp_path: Path
 ) -> None:

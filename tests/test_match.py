@@ -520,3 +520,8 @@ def test_forward_motion_is_detected(
     assert not report.forward_motion
     assert "--Mapper" not in report.next_commands[0]
     assert "--forward_motion" not in report.next_commands[1]
+    report = replace(report, small_angles=True)
+    assert report.map_options.init_min_tri_angle == 4.0
+    with_colmap, ours, _ = report.next_commands
+    assert "--Mapper.init_min_tri_angle 4" in with_colmap
+    assert "--init_min_tri_angle 4" in ours

@@ -17,11 +17,11 @@ from colmap_av1.geometry.cameras import camera_fault, focal_length_warning
 from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.gaps import Gap, few_matches_warning
 from colmap_av1.matching.mapper_limits import (
+    FORWARD_MOTION,
     INITIAL_LEAST_ANGLE,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
     MIN_INLIERS,
-    forward_motion_words,
 )
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.util.texts import check_name
@@ -326,7 +326,8 @@ def motion_findings(
         yield Finding(
             "warning",
             "the camera moves along its axis: the incremental mapper starts only with "
-            f"{' '.join(forward_motion_words())}, and the focal length is not observable",
+            f"{' '.join(FORWARD_MOTION.words)}, and the focal length is not "
+            "observable",
         )
 
 

@@ -62,6 +62,8 @@ def match_rows(report: MatchReport) -> Rows:
         rows.append(("focal length", f"{report.focal_length:.1f} px, estimated"))
     if report.forward_motion:
         rows.append(("motion", "forward: the mapper needs the options below, and known intrinsics"))
+    elif report.small_angles:
+        rows.append(("triangulation angles", "small: the mapper starts well with the option below"))
     return [*rows, *_seconds_rows(report.seconds)]
 
 

@@ -1,7 +1,8 @@
-"""Demote pairs whose pose would mislead COLMAP's incremental mapper."""
+"""Choose the pairs of images with which COLMAP's incremental mapper may begin."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -10,12 +11,15 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.matching.growth import Growth
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.mapper_limits import (
-    FORWARD_MOTION_OPTIONS,
-    INITIAL_MAX_FORWARD_MOTION,
+    DEFAULT_LIMITS,
+    FORWARD_MOTION,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
+    SMALL_ANGLES,
+    InitialLimits,
 )
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewGeometry
 from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
@@ -28,8 +32,13 @@ _Floats = NDArray[np.float64]
 # the angle.
 _MIN_INLIERS = INITIAL_MIN_INLIERS // 2
 # The mapper estimates poses anew: it certainly accepts a pair that exceeds its limits by the first
-# factor, and may accept one with the second share of the angle.
-_MARGIN, _WIDE_SHARE = 1.1, 0.75
+# factor, and may accept one with the second share of the angle. The share of the translation along
+# the optical axis differs by less than the margin.
+_MARGIN, _WIDE_SHARE, _ALONG_MARGIN = 1.1, 0.75, 0.02
+# A model is large if it has this share of the images of the largest model that grows from any of
+# this many pairs.
+_LARGE = 0.8
+_NUM_GROWN = 16
 # Neighbours, which keep their inliers to connect the images, are at most this many images apart.
 NEIGHBOURS = 2
 # About this many inliers decide as well as all of them.
@@ -47,13 +56,30 @@ _ERROR_FACTOR = 1.5
 _ERROR_QUANTILE = 0.9
 
 
-def demote_bad_initial_pairs(
+@dataclass(frozen=True)
+class PreparedStart:
+    """Matches from which COLMAP's incremental mapper starts well.
+
+    Attributes:
+        matched: the images. Pairs that would be a bad initial pair have fewer inliers.
+        limits: the limits of the initial pair that the mapper needs.
+        is_certain: a pair certainly meets these limits. If not, the mapper has to lower them.
+        may_meet_defaults: a pair may meet the default limits.
+    """
+
+    matched: MatchedImages
+    limits: InitialLimits
+    is_certain: bool
+    may_meet_defaults: bool
+
+
+def prepare_start(
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
     clock: Clock,
     known: Sequence[Sequence[_Floats | None]] = (),
-) -> tuple[MatchedImages, bool]:
-    """Limit the inliers of pairs with a wrong pose from which the mapper might start.
+) -> PreparedStart:
+    """Limit the inliers of pairs with which the mapper should not begin, and choose its limits.
 
     COLMAP's mapper takes a pair's pose from its homography if that explains most of the matches
     (`EstimateTwoViewGeometryPose`). If the matches or known poses contradict the pose, a model that
@@ -61,12 +87,14 @@ def demote_bad_initial_pairs(
     pair keeps enough inliers to connect its images; tracks continue through the pairs between.
     Pairs keep all inliers if the mapper finds a good pair before it lowers its limits to theirs.
 
-    If no pair meets its first limits, it tries hundreds of pairs with few inliers. RANSAC may give
-    any of them a wrong pose with a large angle, or intrinsics may diverge. With known poses, these
-    pairs are demoted, too, except neighbours, which connect the images.
+    Known poses also show with which limits the mapper begins with a pair that grows to the largest
+    model, or nearly, see `Growth`. These limits are chosen, the default ones if possible, and those
+    for forward motion only if necessary: somebody who walks through a room moves forward most of
+    the time, but not always. Worse pairs that the mapper would find earlier are demoted.
 
-    If a pair with a known pose meets the mapper's first limits, it needs no options for forward
-    motion: somebody who walks through a room moves forward most of the time, but not always.
+    If no pair meets the default limits, the mapper tries hundreds of pairs with few inliers. RANSAC
+    may give any of them a wrong pose with a large angle, or intrinsics may diverge. With known
+    poses, these pairs are demoted, too, except neighbours, which connect the images.
 
     Args:
         matched: the images. The pose of the homography is tested only for pairs with an essential
@@ -75,48 +103,38 @@ def demote_bad_initial_pairs(
         clock: gets the stage "verification".
         known: for each model with known poses, float64 [3, 4] cam_from_world of each image, None if
             it is not in the model. The relative pose of images in different models is not known.
-
-    Returns:
-        The images with fewer inliers, without forward motion if the mapper needs no options for it,
-        and whether a pair certainly meets the mapper's first limits.
     """
     with clock.measure("verification"):
-        wrong = dict[int, float]()
-        few = list[int]()
-        has_start = False
-        for k, (pair, geometry) in enumerate(
-            zip(matched.pairs.tolist(), matched.geometries, strict=True)
-        ):
-            count = len(geometry.inlier_matches)
-            if count < _MIN_INLIERS:
-                continue
-            some = _some_inliers(matched, cameras, pair, geometry)
-            pose = _pose(geometry, some)
-            if pose is None:
-                continue
-            angle = _triangulation_angle(pose[:, :3], some.rays)
-            flat_angle = _contradicted_angle(geometry, some)
-            rotation = _known_rotation(known, pair)
-            if flat_angle is not None:
-                wrong[k] = flat_angle
-            elif rotation is not None and _angle_between(pose[:, :3], rotation) > _WRONG * angle:
-                wrong[k] = angle
-            elif count >= _MARGIN * INITIAL_MIN_INLIERS:
-                is_aside = abs(pose[2, 3]) < INITIAL_MAX_FORWARD_MOTION
-                has_start |= is_aside and angle >= _MARGIN * INITIAL_MIN_ANGLE
-            if count < _MARGIN * INITIAL_MIN_INLIERS and abs(pair[1] - pair[0]) > NEIGHBOURS:
-                few.append(k)
-        least = INITIAL_MIN_ANGLE if has_start else INITIAL_MIN_ANGLE / 2
-        if matched.forward_motion:
-            least = min(least, FORWARD_MOTION_OPTIONS["init_min_tri_angle"])
+        found = _Candidates.of(matched, cameras, known)
+        if known:
+            search = _Search(matched.pairs, found, Growth(matched, cameras, known))
+            limits = FORWARD_MOTION if matched.forward_motion else SMALL_ANGLES
+            is_certain, demote = False, set[int]()
+            for tried in (DEFAULT_LIMITS, SMALL_ANGLES, FORWARD_MOTION):
+                early = search.pairs_before_a_good_one(tried)
+                if early is not None:
+                    limits, is_certain, demote = tried, True, early
+                    break
+            if limits != DEFAULT_LIMITS:
+                is_few = found.is_far & (found.count < _MARGIN * INITIAL_MIN_INLIERS)
+                demote |= set(np.flatnonzero(is_few & ~np.isnan(found.angle)).tolist())
+        else:
+            limits = FORWARD_MOTION if matched.forward_motion else DEFAULT_LIMITS
+            is_certain, demote = bool(found.certain(limits).any()), set[int]()
+        least = INITIAL_MIN_ANGLE / 2
+        if limits == DEFAULT_LIMITS and is_certain:
+            least = INITIAL_MIN_ANGLE
+        elif limits == FORWARD_MOTION and not known:
+            least = FORWARD_MOTION.init_min_tri_angle
+        is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * least)
+        demote |= set(np.flatnonzero(is_bad).tolist())
         geometries = list(matched.geometries)
-        bad = {k for k, angle in wrong.items() if angle >= _WIDE_SHARE * least}
-        if known and not has_start:
-            bad.update(few)
-        for k in bad:
+        for k in demote:
             geometries[k] = demoted(geometries[k])
-        forward = matched.forward_motion and not (known and has_start)
-    return replace(matched, geometries=geometries, forward_motion=forward), has_start
+    forward = limits == FORWARD_MOTION
+    matched = replace(matched, geometries=geometries, forward_motion=forward)
+    sound = found.possible(DEFAULT_LIMITS) & ~found.is_wrong & found.is_known
+    return PreparedStart(matched, limits, is_certain, bool(sound.any()))
 
 
 def demoted(geometry: TwoViewGeometry) -> TwoViewGeometry:
@@ -126,6 +144,137 @@ def demoted(geometry: TwoViewGeometry) -> TwoViewGeometry:
         return geometry
     chosen = evenly_spread(count, _MIN_INLIERS - 1, rounded=True)
     return replace(geometry, inlier_matches=geometry.inlier_matches[chosen])
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """What decides whether the mapper may begin with each pair of images.
+
+    Attributes:
+        count: int64 [num_pairs] number of inliers.
+        angle: float64 [num_pairs] triangulation angle in degrees by the pose of the two-view
+            geometry; NaN if the pair has no pose or too few inliers.
+        along: float64 [num_pairs] share of the translation of this pose along the optical axis.
+        is_wrong: bool [num_pairs] whether the pose is wrong.
+        is_known: bool [num_pairs] whether the relative pose of the images is known.
+        is_far: bool [num_pairs] whether the images are no neighbours.
+    """
+
+    count: NDArray[np.int64]
+    angle: _Floats
+    along: _Floats
+    is_wrong: NDArray[np.bool_]
+    is_known: NDArray[np.bool_]
+    is_far: NDArray[np.bool_]
+
+    @staticmethod
+    def of(
+        matched: MatchedImages,
+        cameras: Sequence[pycolmap.Camera],
+        known: Sequence[Sequence[_Floats | None]],
+    ) -> _Candidates:
+        """Look at the poses of all pairs."""
+        count = np.array([len(geometry.inlier_matches) for geometry in matched.geometries], int)
+        angle, along = np.full((2, len(count)), np.nan)
+        is_wrong, is_known = np.zeros((2, len(count)), np.bool_)
+        for k in np.flatnonzero(count >= _MIN_INLIERS).tolist():
+            pair, geometry = matched.pairs[k].tolist(), matched.geometries[k]
+            some = _some_inliers(matched, cameras, pair, geometry)
+            pose = _pose(geometry, some)
+            if pose is None:
+                continue
+            angle[k], along[k] = _triangulation_angle(pose[:, :3], some.rays), abs(pose[2, 3])
+            rotation = _known_rotation(known, pair)
+            is_known[k] = rotation is not None
+            flat_angle = _contradicted_angle(geometry, some)
+            if flat_angle is not None:
+                is_wrong[k], angle[k] = True, flat_angle
+            elif rotation is not None:
+                is_wrong[k] = _angle_between(pose[:, :3], rotation) > _WRONG * angle[k]
+        is_far = np.abs(np.diff(matched.pairs, axis=1)[:, 0]) > NEIGHBOURS
+        return _Candidates(count, angle, along, is_wrong, is_known, is_far)
+
+    def certain(self, limits: InitialLimits) -> NDArray[np.bool_]:
+        """Whether the mapper certainly accepts each pair, bool [num_pairs]."""
+        is_certain = ~self.is_wrong & (self.count >= _MARGIN * INITIAL_MIN_INLIERS)
+        is_certain &= self.angle >= _MARGIN * limits.init_min_tri_angle
+        if limits.init_max_forward_motion < 1.0:
+            is_certain &= self.along < limits.init_max_forward_motion - _ALONG_MARGIN
+        return is_certain
+
+    def possible(self, limits: InitialLimits) -> NDArray[np.bool_]:
+        """Whether the mapper may accept each pair, bool [num_pairs]."""
+        is_possible = self.count >= INITIAL_MIN_INLIERS
+        is_possible &= self.angle >= _WIDE_SHARE * limits.init_min_tri_angle
+        return is_possible & (self.along < limits.init_max_forward_motion + _ALONG_MARGIN)
+
+
+class _Search:
+    """The mapper's search for an initial pair among images with known poses.
+
+    Args:
+        pairs: int32 [num_pairs, 2] indices of images.
+        found: what is known of the pairs.
+        growth: the growth of models.
+    """
+
+    def __init__(self, pairs: NDArray[np.int32], found: _Candidates, growth: Growth) -> None:
+        self._pairs, self._found, self._growth = pairs, found, growth
+        self._known_large = dict[int, bool]()
+        some = np.flatnonzero(found.certain(FORWARD_MOTION) & found.is_known)
+        some = some[evenly_spread(len(some), min(len(some), _NUM_GROWN))]
+        grown = [int(growth.registered(pairs[k].tolist()).sum()) for k in some]
+        self._enough = math.ceil(_LARGE * max(grown, default=0))
+
+    def pairs_before_a_good_one(self, limits: InitialLimits) -> set[int] | None:
+        """Pairs that the mapper may find before it finds a good one.
+
+        A pair is good if its pose is right and a large model grows from it. If the limits are not
+        the default ones, it must also meet them with certainty: RANSAC may get a pose wrong if the
+        angle is only a few degrees.
+
+        Returns:
+            Indices of the pairs, without neighbours; None if no good pair certainly meets the
+            limits.
+        """
+        found = self._found
+        certain = found.certain(limits) & found.is_known
+        possible = found.possible(limits) & found.is_known
+        sound = ~found.is_wrong if limits == DEFAULT_LIMITS else certain
+        early = set[int]()
+        while True:
+            count = found.count.copy()
+            count[list(early)] = _MIN_INLIERS - 1
+            num_before = len(early)
+            for k in self._order(count):
+                if not possible[k] or count[k] < INITIAL_MIN_INLIERS:
+                    continue
+                if not sound[k] or not self._is_large(k):
+                    early |= {k} if found.is_far[k] else set()
+                elif certain[k]:
+                    break
+            else:
+                return None
+            if len(early) == num_before:
+                return early
+
+    def _order(self, count: NDArray[np.int64]) -> list[int]:
+        """The pairs in the order in which the mapper tries them.
+
+        It tries the images by their number of matches, each with all others by the number of
+        matches in common.
+        """
+        total = np.bincount(self._pairs.ravel(), np.repeat(count, 2))
+        rank = np.argsort(np.argsort(-total, kind="stable"))
+        order: list[int] = np.lexsort((-count, rank[self._pairs].min(axis=1))).tolist()
+        return order
+
+    def _is_large(self, k: int) -> bool:
+        """Whether a large model grows from a pair."""
+        if k not in self._known_large:
+            grown = self._growth.registered(self._pairs[k].tolist(), most=self._enough)
+            self._known_large[k] = int(grown.sum()) >= self._enough
+        return self._known_large[k]
 
 
 def _known_rotation(

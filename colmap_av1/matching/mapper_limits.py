@@ -1,4 +1,8 @@
-"""Default limits of COLMAP's mappers for using an image pair or starting with it."""
+"""Default limits of COLMAP's mappers for using an image pair, starting with it, and going on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
 
 # Fewest inliers of a pair that a mapper uses (min_num_matches).
 MIN_INLIERS = 15
@@ -13,18 +17,43 @@ LOWER_INITIAL_LIMITS = {
     "init_min_num_inliers": INITIAL_MIN_INLIERS // 2,
     "init_min_tri_angle": INITIAL_MIN_ANGLE / 2,
 }
-# If no pair has that angle, the mapper halves it twice.
+# If no pair has that angle, the mapper halves it twice. Before that, it tries hundreds or thousands
+# of pairs, and begins with the first to which RANSAC gives a wrong pose with a large angle.
 INITIAL_LEAST_ANGLE = INITIAL_MIN_ANGLE / 4
-# The mapper's options for the initial pair if the camera moves along its axis, as on a drive. Its
-# motion then excludes no pair. All angles are small: with the default limit the mapper would try
-# hundreds of pairs, and begin with the first to which RANSAC gives a wrong pose with a large angle.
-FORWARD_MOTION_OPTIONS = {
-    "init_max_forward_motion": 1.0,
-    "init_min_tri_angle": INITIAL_LEAST_ANGLE,
-}
+# Fewest points that an image must observe to be registered (abs_pose_min_num_inliers), and smallest
+# triangulation angle of a point in degrees (filter_min_tri_angle).
+REGISTRATION_MIN_INLIERS = 30
+POINT_MIN_ANGLE = 1.5
 
 
-def forward_motion_words() -> list[str]:
-    """`FORWARD_MOTION_OPTIONS` as words of a command line of COLMAP's mapper."""
-    options = FORWARD_MOTION_OPTIONS.items()
-    return [word for name, value in options for word in (f"--Mapper.{name}", f"{value:g}")]
+@dataclass(frozen=True)
+class InitialLimits:
+    """Limits of the initial pair, by the names of the options of COLMAP's mapper.
+
+    Attributes:
+        init_max_forward_motion: largest share of the translation along the optical axis, below 1.
+        init_min_tri_angle: smallest triangulation angle in degrees.
+    """
+
+    init_max_forward_motion: float = INITIAL_MAX_FORWARD_MOTION
+    init_min_tri_angle: float = INITIAL_MIN_ANGLE
+
+    @property
+    def options(self) -> dict[str, float]:
+        """Options of the mapper that differ from its defaults."""
+        default = vars(InitialLimits())
+        return {name: value for name, value in vars(self).items() if value != default[name]}
+
+    @property
+    def words(self) -> list[str]:
+        """These options as words of a command line."""
+        options = self.options.items()
+        return [word for name, value in options for word in (f"--Mapper.{name}", f"{value:g}")]
+
+
+DEFAULT_LIMITS = InitialLimits()
+# For videos in which all angles are small.
+SMALL_ANGLES = InitialLimits(init_min_tri_angle=INITIAL_LEAST_ANGLE)
+# For videos in which the camera moves along its axis, as on a drive: all angles are small, and the
+# motion excludes no pair.
+FORWARD_MOTION = InitialLimits(1.0, INITIAL_LEAST_ANGLE)

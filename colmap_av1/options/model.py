@@ -96,6 +96,14 @@ class MapOptions(Options):
         "a small angle",
         common=True,
     )
+    init_min_tri_angle: float | None = option(
+        None,
+        "smallest triangulation angle of the incremental mapper's initial pair, in degrees; None: "
+        "COLMAP's 16, or 4 with forward_motion",
+        above=0,
+        below=90,
+        unit="degrees",
+    )
     refine_intrinsics: bool | None = option(
         None,
         "refine focal length and distortion; None: unless the camera moves along its axis, where "
@@ -119,11 +127,16 @@ class MapOptions(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.forward_motion and self.mapper != "incremental":
-            raise OptionError(
-                "forward_motion applies to the incremental mapper only: leave it out, or give "
-                "--mapper incremental"
-            )
+        of_initial_pair = {
+            "forward_motion": self.forward_motion,
+            "init_min_tri_angle": self.init_min_tri_angle is not None,
+        }
+        for name, is_given in of_initial_pair.items():
+            if is_given and self.mapper != "incremental":
+                raise OptionError(
+                    f"{name} applies to the incremental mapper only: leave it out, or give "
+                    "--mapper incremental"
+                )
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import read_model
-from colmap_av1.matching.mapper_limits import FORWARD_MOTION_OPTIONS
+from colmap_av1.matching.mapper_limits import FORWARD_MOTION
 from colmap_av1.options import MapOptions
 from colmap_av1.poses import mapper_process as child
 from colmap_av1.poses.mapper_process import run_mapping
@@ -136,6 +136,9 @@ def _mapping_settings(
     database: Path, output: Path, options: MapOptions, image_path: Path | None
 ) -> dict[str, Any]:
     refine = options.refine_intrinsics
+    initial_pair = FORWARD_MOTION.options if options.forward_motion else {}
+    if options.init_min_tri_angle is not None:
+        initial_pair = {**initial_pair, "init_min_tri_angle": options.init_min_tri_angle}
     return {
         "task": "mapping",
         "database": str(database),
@@ -143,7 +146,7 @@ def _mapping_settings(
         "image_path": str(image_path) if image_path is not None else None,
         "mapper": options.mapper,
         "refine_intrinsics": refine if refine is not None else not options.forward_motion,
-        "initial_pair": FORWARD_MOTION_OPTIONS if options.forward_motion else {},
+        "initial_pair": initial_pair,
         "seed": options.seed,
         "num_threads": threads_or_cpus(options.num_threads),
         "tolerance": None,

@@ -9,8 +9,9 @@ the first five images, so the mapper itself is run until its first model has a n
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,12 @@ import pycolmap
 
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import NEIGHBOURS, demoted
-from colmap_av1.matching.mapper_limits import LOWER_INITIAL_LIMITS
+from colmap_av1.matching.initial_pairs import NEIGHBOURS, PreparedStart, demoted
+from colmap_av1.matching.mapper_limits import (
+    FORWARD_MOTION,
+    LOWER_INITIAL_LIMITS,
+    SMALL_ANGLES,
+)
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
 from colmap_av1.util.run_context import RunContext
@@ -34,26 +39,23 @@ _MAX_TRIALS = 5
 
 
 def demote_failing_starts(
-    matched: MatchedImages,
+    start: PreparedStart,
     names: Sequence[str],
     cameras: Sequence[pycolmap.Camera],
     context: RunContext,
-    *,
-    meets_first_limits: bool,
 ) -> MatchedImages:
     """Limit the inliers of pairs from which COLMAP's incremental mapper starts a model in vain.
 
-    The mapper runs with one thread and the seed 0, with its defaults or with the options that
-    `match` prints for forward motion. Other seeds and versions nearly always start alike.
+    The mapper runs with one thread and the seed 0, with the options that `match` prints, and also
+    without them. Other seeds and versions mostly start alike. If no pair meets the default limits
+    of an initial pair, the trials without options begin with the lower limits that the mapper tries
+    later, because it takes the mapper many seconds to find that no pair meets the first ones.
 
     Args:
-        matched: the images.
-        names: their names.
+        start: the images, and the mapper's limits.
+        names: names of the images.
         cameras: the camera of each image.
         context: its clock gets the stage "verification".
-        meets_first_limits: whether a pair meets the mapper's limits for an initial pair. If not,
-            the trials begin with the lower limits that the mapper tries later, because it takes
-            many seconds to find that no pair meets the first ones.
 
     Returns:
         The images with fewer inliers; the given ones if no trial succeeds.
@@ -61,11 +63,11 @@ def demote_failing_starts(
     Raises:
         ModelError: the mapper stopped.
     """
-    most = np.unique(matched.pairs).size // 2
+    most = np.unique(start.matched.pairs).size // 2
     num_images = max(_LEAST_IMAGES, min(_NUM_IMAGES, most))
     options = MapOptions(
         mapper="incremental",
-        forward_motion=matched.forward_motion,
+        forward_motion=start.limits == FORWARD_MOTION,
         seed=0,
         num_threads=1,
     )
@@ -75,25 +77,55 @@ def demote_failing_starts(
     for camera in copies.values():
         camera.has_prior_focal_length = True
     known = [copies[id(camera)] for camera in cameras]
+
+    def failing_start(limits: dict[str, float], matched: MatchedImages) -> list[str] | None:
+        with tempfile.TemporaryDirectory() as folder:
+            database, log = Path(folder) / "matches.db", Path(folder) / "log"
+            write_matched_images(database, names, known, matched)
+            return start_mapper(database, options, num_images, log=log, initial_pair=limits)
+
+    found = start.matched
+    with context.clock.measure("verification"):
+        for limits in _tried_limits(start):
+            found = _without_failing_starts(found, names, partial(failing_start, limits))
+    return found
+
+
+def _tried_limits(start: PreparedStart) -> list[dict[str, float]]:
+    """Limits of the initial pair for each series of trials."""
+    if not start.is_certain:
+        return [LOWER_INITIAL_LIMITS]
+    series = [start.limits.options]
+    if start.limits == SMALL_ANGLES:
+        series.append({} if start.may_meet_defaults else LOWER_INITIAL_LIMITS)
+    return series
+
+
+def _without_failing_starts(
+    matched: MatchedImages,
+    names: Sequence[str],
+    failing_start: Callable[[MatchedImages], list[str] | None],
+) -> MatchedImages:
+    """Demote the pairs of small first models until a trial succeeds.
+
+    Args:
+        matched: the images.
+        names: their names.
+        failing_start: runs the mapper, see `start_mapper`.
+
+    Returns:
+        The images with fewer inliers; the given ones if no trial succeeds.
+    """
     found = matched
-    with context.clock.measure("verification"), tempfile.TemporaryDirectory() as folder:
-        for trial in range(_MAX_TRIALS):
-            database = Path(folder) / f"{trial}.db"
-            write_matched_images(database, names, known, found)
-            failed = start_mapper(
-                database,
-                options,
-                num_images,
-                log=Path(folder) / "log",
-                initial_pair={} if meets_first_limits else LOWER_INITIAL_LIMITS,
-            )
-            if failed is None:
-                return found
-            is_in = np.isin(matched.pairs, [names.index(name) for name in failed]).all(axis=1)
-            is_in &= np.diff(matched.pairs, axis=1)[:, 0] > NEIGHBOURS
-            geometries = [
-                demoted(geometry) if demote else geometry
-                for geometry, demote in zip(found.geometries, is_in.tolist(), strict=True)
-            ]
-            found = replace(found, geometries=geometries)
+    for _ in range(_MAX_TRIALS):
+        failed = failing_start(found)
+        if failed is None:
+            return found
+        is_in = np.isin(matched.pairs, [names.index(name) for name in failed]).all(axis=1)
+        is_in &= np.diff(matched.pairs, axis=1)[:, 0] > NEIGHBOURS
+        geometries = [
+            demoted(geometry) if demote else geometry
+            for geometry, demote in zip(found.geometries, is_in.tolist(), strict=True)
+        ]
+        found = replace(found, geometries=geometries)
     return matched

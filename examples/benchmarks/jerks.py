@@ -18,7 +18,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,6 @@ class Whole:
         name: name of the sequence.
         pictures: all frames.
         camera: options for the known camera.
-        forward_motion: see `MapOptions`.
         model: model that the places are chosen by, from SIFT, or from `reconstruct` for the
             rendered clip.
         poses: float64 [num_frames, 3, 4] true poses, or those of SIFT's model; NaN where unknown.
@@ -84,7 +83,6 @@ class Whole:
     name: str
     pictures: list[Image]
     camera: CameraOptions
-    forward_motion: bool
     model: Any
     poses: NDArray[np.float64]
 
@@ -182,7 +180,7 @@ def whole_sequence(name: str, folder: Path, console: Console) -> Whole:
     if poses is None:
         poses = model_poses(model, sequence.num_frames)
     pictures = [picture for _, picture in decode_frames(video)]
-    return Whole(name, pictures, camera, case.forward_motion, model, poses)
+    return Whole(name, pictures, camera, model, poses)
 
 
 def whole_orbit(folder: Path, console: Console) -> Whole:
@@ -195,11 +193,11 @@ def whole_orbit(folder: Path, console: Console) -> Whole:
     write_clip(folder / "orbit.mp4", pictures)
     console.print(f"{RENDERED}: a model of the whole", markup=False)
     output = folder / "whole"
-    given = (folder / "orbit.mp4", output, CameraOptions(), False)
+    given = (folder / "orbit.mp4", output, CameraOptions())
     run_measured(run_reconstruct, *given, log=folder / "log")
     model = read_model(output / "sparse" / "0")
     poses = phone_clip.true_poses(len(pictures))
-    return Whole(RENDERED, pictures, CameraOptions(), False, model, poses)
+    return Whole(RENDERED, pictures, CameraOptions(), model, poses)
 
 
 def try_place(
@@ -319,26 +317,25 @@ def way_of(way: str, whole: Whole, clip: Path, folder: Path) -> tuple[Any | None
     output.parent.mkdir(parents=True, exist_ok=True)
     run = run_reconstruct if way == "reconstruct" else run_match
     try:
-        given = (clip, output, whole.camera, whole.forward_motion)
-        warnings = run_measured(run, *given, log=folder / "log").result
+        warnings = run_measured(run, clip, output, whole.camera, log=folder / "log").result
     except ColmapAv1Error as error:
         return None, [str(error)]
     model = "sparse/0" if way == "reconstruct" else "models/0"
     return read_model(output / model), warnings
 
 
-def run_reconstruct(clip: Path, output: Path, camera: CameraOptions, _: bool) -> list[str]:
+def run_reconstruct(clip: Path, output: Path, camera: CameraOptions) -> list[str]:
     """Reconstruct with default options, like the command."""
     options = ReconstructOptions(match=MatchOptions(camera=camera, images=EVERY_FRAME))
     return about_the_model(reconstruct(clip, output, options=options).warnings)
 
 
-def run_match(clip: Path, output: Path, camera: CameraOptions, forward: bool) -> list[str]:
+def run_match(clip: Path, output: Path, camera: CameraOptions) -> list[str]:
     """A database, mapped by COLMAP's incremental mapper."""
     output.mkdir()
     options = MatchOptions(camera=camera, images=EVERY_FRAME)
     matched = match(output / "a.db", clip, image_path=output / "images", options=options)
-    settings = MapOptions(refine_intrinsics=camera.camera_params is None, forward_motion=forward)
+    settings = replace(matched.map_options, refine_intrinsics=camera.camera_params is None)
     mapped = map_database(output / "a.db", output / "images", output / "models", options=settings)
     missing = mapped.num_images - mapped.num_registered[0]
     parts = [f"{missing} images are not registered in folder 0"] if missing else []

@@ -28,6 +28,7 @@ import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writi
 import phone_clip
 import pycolmap
 import render
+from mapping import map_incrementally
 from results import add_results, read_rows, save
 from rich.console import Console
 from sequences import model_poses, read_sequence
@@ -55,7 +56,6 @@ from colmap_av1.evaluate import (
 )
 from colmap_av1.evaluate.frontends.frontend import list_images
 from colmap_av1.geometry.colmap_model import read_model
-from colmap_av1.matching.mapper_limits import FORWARD_MOTION_OPTIONS
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 from colmap_av1.video.coded_size import with_downscale
@@ -212,10 +212,9 @@ def measure_match(clip: Clip, folder: Path) -> list[Row]:
     copy, output = folder / "copy.db", folder / "pycolmap"
     shutil.copyfile(database, copy)
     shutil.rmtree(output, ignore_errors=True)
-    forward = "--Mapper.init_max_forward_motion" in command
     runs = {
         render.MATCH_PYCOLMAP: (
-            run_measured(map_incrementally, copy, images, output, forward, log=log),
+            run_measured(map_incrementally, copy, images, output, command, log=log),
             output / "0",
         )
     }
@@ -241,19 +240,6 @@ def run_match(video: Path, database: Path, images: Path, options: MatchOptions) 
 def run_command(words: str) -> None:
     """Run a command line in a shell."""
     subprocess.run(words, shell=True, check=True)
-
-
-def map_incrementally(database: Path, images: Path, output: Path, forward: bool) -> None:
-    """Map with pycolmap's incremental mapper; `forward`: with the options for forward motion."""
-    output.mkdir()
-    pycolmap.set_random_seed(0)
-    how = pycolmap.IncrementalPipelineOptions(random_seed=0)
-    if forward:
-        for name, value in FORWARD_MOTION_OPTIONS.items():
-            setattr(how.mapper, name, value)
-        how.ba_refine_focal_length = False
-        how.ba_refine_extra_params = False
-    pycolmap.incremental_mapping(database, images, output, options=how)
 
 
 def measure_sift(clip: Clip, folder: Path, names: list[str], *, mapped: bool) -> list[Row]:

@@ -26,6 +26,7 @@ import numpy as np
 import pycolmap
 import render
 import room
+from mapping import map_incrementally
 from numpy.typing import NDArray
 from results import add_results, read_rows, save
 from sequences import model_poses
@@ -110,15 +111,17 @@ def measure(video: Path, seed: int, way: str) -> Row:
             if way == MATCH:
                 matched = match(database, video, image_path=images)
                 num_images, warnings = matched.num_images, matched.warnings
+                command = matched.next_commands[0]
             else:
                 frames = range(len(truth))
                 write_images(video, images, [f"{frame:06d}.png" for frame in frames], frames)
                 one = pycolmap.CameraMode.SINGLE
                 pycolmap.extract_features(database, images, camera_mode=one)
                 pycolmap.match_sequential(database)
-            (output / "models").mkdir()
-            found = pycolmap.incremental_mapping(database, images, output / "models")
-            made = [found[number] for number in sorted(found)]
+                command = ""
+            map_incrementally(database, images, output / "models", command)
+            folders = sorted((output / "models").iterdir(), key=lambda own: int(own.name))
+            made = [read_model(own) for own in folders]
     except ColmapAv1Error as error:
         return Row(str(seed), way, 0, "", "", str(error))
     models = [model_poses(own, len(truth)) for own in made]

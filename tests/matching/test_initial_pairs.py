@@ -11,8 +11,8 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import demote_bad_initial_pairs
-from colmap_av1.matching.mapper_limits import INITIAL_MIN_INLIERS
+from colmap_av1.matching.initial_pairs import prepare_start
+from colmap_av1.matching.mapper_limits import FORWARD_MOTION, INITIAL_MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.verify import verify_pairs
@@ -64,7 +64,7 @@ def verified(keypoints: list[ImageKeypoints], matches: NDArray[np.uint32]) -> Tw
 
 def demoted(keypoints: list[ImageKeypoints], geometry: TwoViewGeometry) -> TwoViewGeometry:
     matched = MatchedImages(keypoints, PAIR, [geometry.inlier_matches], [geometry], False)
-    return demote_bad_initial_pairs(matched, [CAMERA] * 2, Clock())[0].geometries[0]
+    return prepare_start(matched, [CAMERA] * 2, Clock()).matched.geometries[0]
 
 
 def angle_of_mapper(keypoints: list[ImageKeypoints], matches: NDArray[np.uint32]) -> float:
@@ -133,14 +133,14 @@ def test_pair_with_a_wrong_pose_is_demoted(
     geometry = verified(keypoints, matches)
     matched = MatchedImages(keypoints, PAIR, [matches], [geometry], forward_motion)
     wrong = Rotation.from_euler("y", turned + 20, degrees=True).as_matrix()
-    poses = [np.eye(3, 4), np.hstack([wrong, [[0], [0], [1]]])]
-    found, meets_first_limits = demote_bad_initial_pairs(matched, [CAMERA] * 2, Clock(), [poses])
-    count = len(found.geometries[0].inlier_matches)
-    assert (count == len(geometry.inlier_matches)) == is_kept == meets_first_limits
+    poses = [np.eye(3, 4), np.column_stack([wrong, [0, 0, 1] - wrong[:, 2]])]
+    found = prepare_start(matched, [CAMERA] * 2, Clock(), [poses])
+    count = len(found.matched.geometries[0].inlier_matches)
+    assert (count == len(geometry.inlier_matches)) == is_kept == found.is_certain
     assert count >= 40
     assert is_kept or count < INITIAL_MIN_INLIERS / 2
     # The mapper needs options for forward motion only if it has no pair to start from.
-    assert found.forward_motion == (forward_motion and not is_kept)
+    assert (found.limits == FORWARD_MOTION) == (forward_motion and not is_kept)
 
 
 def test_wrong_pair_below_the_angle_of_a_good_pair_is_kept() -> None:
@@ -151,7 +151,7 @@ def test_wrong_pair_below_the_angle_of_a_good_pair_is_kept() -> None:
     geometries = [verified(*views) for views in (wide, narrow)]
     pairs = np.array([[0, 1], [2, 3]], dtype=np.int32)
     turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
-    of_wide = [np.eye(3, 4), np.hstack([turn, [[0], [0], [1]]])]
+    of_wide = [np.eye(3, 4), np.column_stack([turn, [0, 0, 1] - turn[:, 2]])]
     of_narrow = [np.eye(3, 4), np.hstack([turn, [[0], [0], [0]]])]
     poses = [*of_wide, *of_narrow]
     for chosen, is_kept in (([0, 1], True), ([1], False)):
@@ -162,10 +162,8 @@ def test_wrong_pair_below_the_angle_of_a_good_pair_is_kept() -> None:
             [geometries[k] for k in chosen],
             False,
         )
-        found, meets_first_limits = demote_bad_initial_pairs(
-            matched, [CAMERA] * 4, Clock(), [poses]
-        )
-        assert (found.geometries[-1] is geometries[1]) == is_kept == meets_first_limits
+        found = prepare_start(matched, [CAMERA] * 4, Clock(), [poses])
+        assert (found.matched.geometries[-1] is geometries[1]) == is_kept == found.is_certain
 
 
 def test_pair_with_few_inliers_is_demoted_if_no_pair_has_a_large_angle() -> None:
@@ -185,6 +183,6 @@ def test_pair_with_few_inliers_is_demoted_if_no_pair_has_a_large_angle() -> None
     matched = MatchedImages(
         keypoints, pairs, [g.inlier_matches for g in geometries], geometries, False
     )
-    found, _ = demote_bad_initial_pairs(matched, [CAMERA] * 10, Clock(), [poses])
-    kept = [a is b for a, b in zip(found.geometries, geometries, strict=True)]
+    found = prepare_start(matched, [CAMERA] * 10, Clock(), [poses])
+    kept = [a is b for a, b in zip(found.matched.geometries, geometries, strict=True)]
     assert kept == [True, False, True]

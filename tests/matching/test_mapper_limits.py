@@ -16,7 +16,9 @@ def test_limits_agree_with_colmap() -> None:
     assert incremental.mapper.init_min_num_inliers == limits.INITIAL_MIN_INLIERS
     assert incremental.mapper.init_max_forward_motion == limits.INITIAL_MAX_FORWARD_MOTION
     assert incremental.mapper.init_min_tri_angle == limits.INITIAL_MIN_ANGLE
-    assert all(hasattr(incremental.mapper, name) for name in limits.FORWARD_MOTION_OPTIONS)
+    assert incremental.mapper.abs_pose_min_num_inliers == limits.REGISTRATION_MIN_INLIERS
+    assert incremental.mapper.filter_min_tri_angle == limits.POINT_MIN_ANGLE
+    assert all(hasattr(incremental.mapper, name) for name in limits.FORWARD_MOTION.options)
 
 
 def test_two_view_configurations_agree_with_colmap() -> None:

@@ -137,6 +137,8 @@ REFUSED: list[tuple[type, dict[str, Any]]] = [
     (TriangulateOptions, {"max_depth_error": 0}),
     (MapOptions, {"mapper": "auto"}),
     (MapOptions, {"mapper": "global", "forward_motion": True}),
+    (MapOptions, {"mapper": "global", "init_min_tri_angle": 4.0}),
+    (MapOptions, {"init_min_tri_angle": 90.0}),
     (MapOptions, {"seed": -1}),
     (MapOptions, {"num_threads": 0}),
     (MapperOptions, {"mapper": "best"}),

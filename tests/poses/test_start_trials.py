@@ -15,7 +15,8 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, make_scene, match_scen
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.mapper_limits import INITIAL_MIN_INLIERS
+from colmap_av1.matching.initial_pairs import PreparedStart
+from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS, INITIAL_MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import CameraOptions
@@ -93,18 +94,18 @@ def test_pair_from_which_no_model_grows_is_demoted(
     with_moving_object: MatchedImages, tmp_path: Path
 ) -> None:
     assert num_registered(with_moving_object, tmp_path / "before")[0] < NUM_IMAGES / 2
-    found = demote_failing_starts(
-        with_moving_object, NAMES, [CAMERA] * NUM_IMAGES, RunContext(), meets_first_limits=True
+    start = PreparedStart(
+        with_moving_object, DEFAULT_LIMITS, is_certain=True, may_meet_defaults=True
     )
+    found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, RunContext())
     assert num_registered(found, tmp_path / "after") == [NUM_IMAGES]
     counts = [len(geometry.inlier_matches) for geometry in found.geometries[-3:]]
     assert 15 <= min(counts) < INITIAL_MIN_INLIERS / 2
 
 
 def test_pairs_keep_their_inliers_if_the_mapper_starts_well(scene: MatchedImages) -> None:
-    found = demote_failing_starts(
-        scene, NAMES, [CAMERA] * NUM_IMAGES, RunContext(), meets_first_limits=True
-    )
+    start = PreparedStart(scene, DEFAULT_LIMITS, is_certain=True, may_meet_defaults=True)
+    found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, RunContext())
     assert found.geometries == scene.geometries
 
 
@@ -115,7 +116,6 @@ def test_pairs_keep_their_inliers_if_no_start_succeeds(with_moving_object: Match
         matches=with_moving_object.matches[-3:],
         geometries=with_moving_object.geometries[-3:],
     )
-    found = demote_failing_starts(
-        alone, NAMES, [CAMERA] * NUM_IMAGES, RunContext(), meets_first_limits=True
-    )
+    start = PreparedStart(alone, DEFAULT_LIMITS, is_certain=True, may_meet_defaults=True)
+    found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, RunContext())
     assert found.geometries == alone.geometries

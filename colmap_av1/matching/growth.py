@@ -1,0 +1,122 @@
+"""Predict which images COLMAP's incremental mapper registers after an initial pair."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.mapper_limits import (
+    MIN_INLIERS,
+    POINT_MIN_ANGLE,
+    REGISTRATION_MIN_INLIERS,
+)
+from colmap_av1.util.graphs import connected_components
+
+_Floats = NDArray[np.float64]
+
+
+class Growth:
+    """The growth of a model of COLMAP's incremental mapper, predicted from known poses.
+
+    The mapper registers an image that observes enough points of the model. Few points cross a fast
+    turn, and points need a triangulation angle. Therefore, it depends on the initial pair how far a
+    model grows: from one side of a turn, the mapper may register the other side, but not from the
+    other side. Here a point exists once two registered images observe it at a sufficient angle, as
+    if the mapper found all poses and had no outliers.
+
+    Args:
+        matched: the images.
+        cameras: the camera of each image.
+        known: for each model with known poses, float64 [3, 4] cam_from_world of each image, None if
+            it is not in the model. An image is in one model at most.
+    """
+
+    def __init__(
+        self,
+        matched: MatchedImages,
+        cameras: Sequence[pycolmap.Camera],
+        known: Sequence[Sequence[_Floats | None]],
+    ) -> None:
+        from scipy.sparse import csr_array  # noqa: PLC0415 - slow to import
+
+        self._offsets = np.cumsum([0, *(len(own.xy) for own in matched.keypoints)])
+        edges = [
+            geometry.inlier_matches + self._offsets[pair]
+            for pair, geometry in zip(matched.pairs, matched.geometries, strict=True)
+            if len(geometry.inlier_matches) >= MIN_INLIERS
+        ]
+        self._track = connected_components(
+            int(self._offsets[-1]), np.concatenate([np.empty((0, 2), np.int64), *edges])
+        )
+        views = np.repeat(np.arange(len(cameras)), np.diff(self._offsets))
+        self._rays = np.full((len(views), 3), np.nan)
+        self._model = np.full(len(cameras), -1)
+        placed = [(m, i, p) for m, poses in enumerate(known) for i, p in enumerate(poses)]
+        for model, i, pose in placed:
+            if pose is not None:
+                self._model[i] = model
+                x = np.asarray(cameras[i].cam_from_img(matched.keypoints[i].xy.astype(float)))
+                rays = np.column_stack([x, np.ones(len(x))]) @ pose[:, :3]
+                rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+                self._rays[self._offsets[i] : self._offsets[i + 1]] = rays
+        self._num_tracks = 1 + int(self._track.max(initial=-1))
+        self._observed = csr_array(
+            (np.ones(len(views), np.int32), (self._track, views)),
+            shape=(self._num_tracks, len(cameras)),
+        )
+
+    def registered(self, pair: Sequence[int], most: int | None = None) -> NDArray[np.bool_]:
+        """Which images the mapper registers.
+
+        Args:
+            pair: the initial pair, two images of a model.
+            most: growth ends with this number of images; None: when no further image registers.
+
+        Returns:
+            bool [num_images].
+        """
+        model = _Model(len(self._model), self._num_tracks)
+        for image in pair:
+            self._register(model, image)
+        is_other = self._model != self._model[pair[0]]
+        while most is None or model.registered.sum() < most:
+            num_visible = np.where(is_other | model.registered, 0, model.num_visible)
+            best = int(num_visible.argmax())
+            if num_visible[best] < REGISTRATION_MIN_INLIERS:
+                break
+            self._register(model, best)
+        return model.registered
+
+    def _register(self, model: _Model, image: int) -> None:
+        model.registered[image] = True
+        own = slice(self._offsets[image], self._offsets[image + 1])
+        track, rays = self._track[own], self._rays[own]
+        is_first = np.isnan(model.first_ray[track, 0])
+        model.first_ray[track[is_first]] = rays[is_first]
+        cosine = (model.first_ray[track] * rays).sum(axis=1)
+        is_wide = cosine < np.cos(np.radians(POINT_MIN_ANGLE))
+        new = np.unique(track[is_wide & ~model.is_point[track]])
+        model.is_point[new] = True
+        model.num_visible += self._observed[new].sum(axis=0)
+
+
+class _Model:
+    """A model that grows.
+
+    Attributes:
+        registered: bool [num_images] whether each image is registered.
+        num_visible: int64 [num_images] number of points that each image observes.
+        first_ray: float64 [num_tracks, 3] direction of each track from the first registered image
+            that observes it; NaN if there is none.
+        is_point: bool [num_tracks] whether each track has a point.
+    """
+
+    def __init__(self, num_images: int, num_tracks: int) -> None:
+        self.registered = np.zeros(num_images, np.bool_)
+        self.num_visible = np.zeros(num_images, np.int64)
+        self.first_ray = np.full((num_tracks, 3), np.nan)
+        self.is_point = np.zeros(num_tracks, np.bool_)
