@@ -97,10 +97,10 @@ class MatchReport:
         num_inliers: inlier matches of all pairs.
         configs: number of pairs by COLMAP's name of their two-view configuration.
         forward_motion: the camera moves along its optical axis, as in a driving car: the mapper
-            finds no initial pair unless its options allow this, and the focal length is not
+            finds no good initial pair unless its options allow this, and the focal length is hardly
             observable.
-        small_angles: no pair that the mapper could begin with has a large triangulation angle: it
-            begins at once, and with a correct pair, if its options allow a small one.
+        small_angles: the joint estimate shows that the mapper needs a lower limit of the
+            triangulation angle to begin with a pair from which a large model grows.
         links: SIFT links between images that motion does not connect.
         estimate: summary of the joint estimate of all poses that matches were verified against;
             None if they were verified pair by pair.

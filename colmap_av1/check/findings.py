@@ -22,6 +22,7 @@ from colmap_av1.matching.mapper_limits import (
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
     MIN_INLIERS,
+    SMALL_ANGLES,
 )
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.util.texts import check_name
@@ -319,8 +320,8 @@ def motion_findings(
     elif parallax.angle < INITIAL_MIN_ANGLE:
         yield Finding(
             "note",
-            f"parallax of {parallax.angle:.1f} degrees: the incremental mapper starts only after "
-            "it lowers its limit",
+            f"parallax of {parallax.angle:.1f} degrees: the incremental mapper starts sooner with "
+            f"{' '.join(SMALL_ANGLES.words)}",
         )
     if parallax.focal_known and parallax.forward_share > 0.5:
         yield Finding(

@@ -23,10 +23,12 @@ class Growth:
     """The growth of a model of COLMAP's incremental mapper, predicted from known poses.
 
     The mapper registers an image that observes enough points of the model. Few points cross a fast
-    turn, and points need a triangulation angle. Therefore, it depends on the initial pair how far a
-    model grows: from one side of a turn, the mapper may register the other side, but not from the
-    other side. Here a point exists once two registered images observe it at a sufficient angle, as
-    if the mapper found all poses and had no outliers.
+    turn, and points need a triangulation angle. How far a model grows therefore depends on the
+    initial pair: the mapper may cross a turn in one direction but not in the other.
+
+    The prediction assumes that each registered image gets its right pose and that no match is an
+    outlier. A track has a point once a registered image observes it at a sufficient angle to the
+    first one that does. The larger angle of the first points is ignored.
 
     Args:
         matched: the images.
@@ -54,11 +56,11 @@ class Growth:
         )
         views = np.repeat(np.arange(len(cameras)), np.diff(self._offsets))
         self._rays = np.full((len(views), 3), np.nan)
-        self._model = np.full(len(cameras), -1)
+        self._model_of = np.full(len(cameras), -1)
         placed = [(m, i, p) for m, poses in enumerate(known) for i, p in enumerate(poses)]
-        for model, i, pose in placed:
+        for number, i, pose in placed:
             if pose is not None:
-                self._model[i] = model
+                self._model_of[i] = number
                 x = np.asarray(cameras[i].cam_from_img(matched.keypoints[i].xy.astype(float)))
                 rays = np.column_stack([x, np.ones(len(x))]) @ pose[:, :3]
                 rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -69,21 +71,21 @@ class Growth:
             shape=(self._num_tracks, len(cameras)),
         )
 
-    def registered(self, pair: Sequence[int], most: int | None = None) -> NDArray[np.bool_]:
+    def registered(self, pair: Sequence[int], max_images: int | None = None) -> NDArray[np.bool_]:
         """Which images the mapper registers.
 
         Args:
             pair: the initial pair, two images of a model.
-            most: growth ends with this number of images; None: when no further image registers.
+            max_images: growth ends with this number of images, or when no further image registers.
 
         Returns:
             bool [num_images].
         """
-        model = _Model(len(self._model), self._num_tracks)
+        model = _GrowingModel(len(self._model_of), self._num_tracks)
         for image in pair:
             self._register(model, image)
-        is_other = self._model != self._model[pair[0]]
-        while most is None or model.registered.sum() < most:
+        is_other = self._model_of != self._model_of[pair[0]]
+        while max_images is None or model.registered.sum() < max_images:
             num_visible = np.where(is_other | model.registered, 0, model.num_visible)
             best = int(num_visible.argmax())
             if num_visible[best] < REGISTRATION_MIN_INLIERS:
@@ -91,7 +93,7 @@ class Growth:
             self._register(model, best)
         return model.registered
 
-    def _register(self, model: _Model, image: int) -> None:
+    def _register(self, model: _GrowingModel, image: int) -> None:
         model.registered[image] = True
         own = slice(self._offsets[image], self._offsets[image + 1])
         track, rays = self._track[own], self._rays[own]
@@ -104,7 +106,7 @@ class Growth:
         model.num_visible += self._observed[new].sum(axis=0)
 
 
-class _Model:
+class _GrowingModel:
     """A model that grows.
 
     Attributes:

@@ -31,15 +31,19 @@ _Floats = NDArray[np.float64]
 # If no pair meets the mapper's limits for an initial pair, it halves the number of inliers, then
 # the angle.
 _MIN_INLIERS = INITIAL_MIN_INLIERS // 2
-# The mapper estimates poses anew: it certainly accepts a pair that exceeds its limits by the first
-# factor, and may accept one with the second share of the angle. The share of the translation along
-# the optical axis differs by less than the margin.
-_MARGIN, _WIDE_SHARE, _ALONG_MARGIN = 1.1, 0.75, 0.02
+# The mapper estimates poses anew. It certainly accepts a pair that exceeds its limits by this
+# factor.
+_MARGIN = 1.1
+# It may accept a pair with this share of the angle that it requires.
+_WIDE_SHARE = 0.75
+# The share of the translation along the optical axis differs by less than this.
+_ALONG_MARGIN = 0.02
 # A model is large if it has this share of the images of the largest model that grows from any of
 # this many pairs.
 _LARGE = 0.8
 _NUM_GROWN = 16
-# Neighbours, which keep their inliers to connect the images, are at most this many images apart.
+# Neighbours are at most this many images apart. They connect the images, and are only demoted if
+# their pose is wrong.
 NEIGHBOURS = 2
 # About this many inliers decide as well as all of them.
 _NUM_SOME = 64
@@ -63,8 +67,8 @@ class PreparedStart:
     Attributes:
         matched: the images. Pairs that would be a bad initial pair have fewer inliers.
         limits: the limits of the initial pair that the mapper needs.
-        is_certain: a pair certainly meets these limits. If not, the mapper has to lower them.
-        may_meet_defaults: a pair may meet the default limits.
+        is_certain: a pair certainly meets these limits. If not, the mapper may have to lower them.
+        may_meet_defaults: a pair with a known pose may meet the default limits.
     """
 
     matched: MatchedImages
@@ -84,13 +88,14 @@ def prepare_start(
     COLMAP's mapper takes a pair's pose from its homography if that explains most of the matches
     (`EstimateTwoViewGeometryPose`). If the matches or known poses contradict the pose, a model that
     begins with the pair fails after a few images, and the mapper still writes it first. A demoted
-    pair keeps enough inliers to connect its images; tracks continue through the pairs between.
-    Pairs keep all inliers if the mapper finds a good pair before it lowers its limits to theirs.
+    pair keeps enough inliers to connect its images; tracks continue through the pairs between. A
+    bad pair is not demoted if its angle is so small that the mapper finds a good pair first.
 
     Known poses also show with which limits the mapper begins with a pair that grows to the largest
     model, or nearly, see `Growth`. These limits are chosen, the default ones if possible, and those
     for forward motion only if necessary: somebody who walks through a room moves forward most of
-    the time, but not always. Worse pairs that the mapper would find earlier are demoted.
+    the time, but not always. Worse pairs that the mapper would find earlier are demoted, except
+    neighbours.
 
     If no pair meets the default limits, the mapper tries hundreds of pairs with few inliers. RANSAC
     may give any of them a wrong pose with a large angle, or intrinsics may diverge. With known
@@ -116,29 +121,31 @@ def prepare_start(
                     limits, is_certain, demote = tried, True, early
                     break
             if limits != DEFAULT_LIMITS:
-                is_few = found.is_far & (found.count < _MARGIN * INITIAL_MIN_INLIERS)
-                demote |= set(np.flatnonzero(is_few & ~np.isnan(found.angle)).tolist())
+                has_few = found.is_far & (found.count < _MARGIN * INITIAL_MIN_INLIERS)
+                demote |= set(np.flatnonzero(has_few & ~np.isnan(found.angle)).tolist())
         else:
             limits = FORWARD_MOTION if matched.forward_motion else DEFAULT_LIMITS
             is_certain, demote = bool(found.certain(limits).any()), set[int]()
-        least = INITIAL_MIN_ANGLE / 2
-        if limits == DEFAULT_LIMITS and is_certain:
-            least = INITIAL_MIN_ANGLE
-        elif limits == FORWARD_MOTION and not known:
-            least = FORWARD_MOTION.init_min_tri_angle
-        is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * least)
+        lowest_angle = limits.init_min_tri_angle
+        if not is_certain:
+            lowest_angle = min(lowest_angle, INITIAL_MIN_ANGLE / 2)
+        elif known:
+            # Wrong pairs with smaller angles are demoted if the mapper would find them first.
+            lowest_angle = max(lowest_angle, INITIAL_MIN_ANGLE / 2)
+        is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * lowest_angle)
         demote |= set(np.flatnonzero(is_bad).tolist())
         geometries = list(matched.geometries)
         for k in demote:
             geometries[k] = demoted(geometries[k])
-    forward = limits == FORWARD_MOTION
-    matched = replace(matched, geometries=geometries, forward_motion=forward)
-    sound = found.possible(DEFAULT_LIMITS) & ~found.is_wrong & found.is_known
-    return PreparedStart(matched, limits, is_certain, bool(sound.any()))
+    remaining = found.possible(DEFAULT_LIMITS) & found.is_known
+    remaining[list(demote)] = False
+    return PreparedStart(
+        replace(matched, geometries=geometries), limits, is_certain, bool(remaining.any())
+    )
 
 
 def demoted(geometry: TwoViewGeometry) -> TwoViewGeometry:
-    """Keep some of the inliers, evenly spread, too few for an initial pair."""
+    """Keep some of the inliers, evenly spread, too few until the mapper lowers its limits twice."""
     count = len(geometry.inlier_matches)
     if count < _MIN_INLIERS:
         return geometry
@@ -154,15 +161,19 @@ class _Candidates:
         count: int64 [num_pairs] number of inliers.
         angle: float64 [num_pairs] triangulation angle in degrees by the pose of the two-view
             geometry; NaN if the pair has no pose or too few inliers.
-        along: float64 [num_pairs] share of the translation of this pose along the optical axis.
+        along: float64 [num_pairs] translation of this pose along the optical axis, as the mapper
+            measures it: not as a share of the whole if the pose is from a homography.
+        known_along: float64 [num_pairs] share of the translation of the known pose along the
+            optical axis; NaN if it is not known.
         is_wrong: bool [num_pairs] whether the pose is wrong.
-        is_known: bool [num_pairs] whether the relative pose of the images is known.
+        is_known: bool [num_pairs] whether the pair has an angle and a known pose.
         is_far: bool [num_pairs] whether the images are no neighbours.
     """
 
     count: NDArray[np.int64]
     angle: _Floats
     along: _Floats
+    known_along: _Floats
     is_wrong: NDArray[np.bool_]
     is_known: NDArray[np.bool_]
     is_far: NDArray[np.bool_]
@@ -175,8 +186,8 @@ class _Candidates:
     ) -> _Candidates:
         """Look at the poses of all pairs."""
         count = np.array([len(geometry.inlier_matches) for geometry in matched.geometries], int)
-        angle, along = np.full((2, len(count)), np.nan)
-        is_wrong, is_known = np.zeros((2, len(count)), np.bool_)
+        angle, along, known_along = np.full((3, len(count)), np.nan)
+        is_wrong = np.zeros(len(count), np.bool_)
         for k in np.flatnonzero(count >= _MIN_INLIERS).tolist():
             pair, geometry = matched.pairs[k].tolist(), matched.geometries[k]
             some = _some_inliers(matched, cameras, pair, geometry)
@@ -184,22 +195,25 @@ class _Candidates:
             if pose is None:
                 continue
             angle[k], along[k] = _triangulation_angle(pose[:, :3], some.rays), abs(pose[2, 3])
-            rotation = _known_rotation(known, pair)
-            is_known[k] = rotation is not None
+            known_pose = _known_pose(known, pair)
+            if known_pose is not None:
+                known_along[k] = abs(known_pose[2, 3])
             flat_angle = _contradicted_angle(geometry, some)
             if flat_angle is not None:
                 is_wrong[k], angle[k] = True, flat_angle
-            elif rotation is not None:
-                is_wrong[k] = _angle_between(pose[:, :3], rotation) > _WRONG * angle[k]
-        is_far = np.abs(np.diff(matched.pairs, axis=1)[:, 0]) > NEIGHBOURS
-        return _Candidates(count, angle, along, is_wrong, is_known, is_far)
+            elif known_pose is not None:
+                turned = _angle_between(pose[:, :3], known_pose[:, :3])
+                is_wrong[k] = turned > _WRONG * angle[k]
+        is_known, is_far = ~np.isnan(known_along), are_far(matched.pairs)
+        return _Candidates(count, angle, along, known_along, is_wrong, is_known, is_far)
 
     def certain(self, limits: InitialLimits) -> NDArray[np.bool_]:
         """Whether the mapper certainly accepts each pair, bool [num_pairs]."""
         is_certain = ~self.is_wrong & (self.count >= _MARGIN * INITIAL_MIN_INLIERS)
         is_certain &= self.angle >= _MARGIN * limits.init_min_tri_angle
         if limits.init_max_forward_motion < 1.0:
-            is_certain &= self.along < limits.init_max_forward_motion - _ALONG_MARGIN
+            along = np.fmax(self.along, self.known_along)
+            is_certain &= along < limits.init_max_forward_motion - _ALONG_MARGIN
         return is_certain
 
     def possible(self, limits: InitialLimits) -> NDArray[np.bool_]:
@@ -224,7 +238,7 @@ class _Search:
         some = np.flatnonzero(found.certain(FORWARD_MOTION) & found.is_known)
         some = some[evenly_spread(len(some), min(len(some), _NUM_GROWN))]
         grown = [int(growth.registered(pairs[k].tolist()).sum()) for k in some]
-        self._enough = math.ceil(_LARGE * max(grown, default=0))
+        self._large_size = math.ceil(_LARGE * max(grown, default=0))
 
     def pairs_before_a_good_one(self, limits: InitialLimits) -> set[int] | None:
         """Pairs that the mapper may find before it finds a good one.
@@ -240,7 +254,9 @@ class _Search:
         found = self._found
         certain = found.certain(limits) & found.is_known
         possible = found.possible(limits) & found.is_known
-        sound = ~found.is_wrong if limits == DEFAULT_LIMITS else certain
+        is_sound = ~found.is_wrong if limits == DEFAULT_LIMITS else certain
+        if not certain.any():
+            return None
         early = set[int]()
         while True:
             count = found.count.copy()
@@ -249,10 +265,11 @@ class _Search:
             for k in self._order(count):
                 if not possible[k] or count[k] < INITIAL_MIN_INLIERS:
                     continue
-                if not sound[k] or not self._is_large(k):
-                    early |= {k} if found.is_far[k] else set()
-                elif certain[k]:
-                    break
+                if is_sound[k] and self._is_large(k):
+                    if certain[k]:
+                        break
+                elif found.is_far[k]:
+                    early.add(k)
             else:
                 return None
             if len(early) == num_before:
@@ -262,7 +279,8 @@ class _Search:
         """The pairs in the order in which the mapper tries them.
 
         It tries the images by their number of matches, each with all others by the number of
-        matches in common.
+        matches in common. With several threads, COLMAP 4.2 tries several images at a time, and may
+        begin with a pair that comes somewhat later.
         """
         total = np.bincount(self._pairs.ravel(), np.repeat(count, 2))
         rank = np.argsort(np.argsort(-total, kind="stable"))
@@ -272,19 +290,27 @@ class _Search:
     def _is_large(self, k: int) -> bool:
         """Whether a large model grows from a pair."""
         if k not in self._known_large:
-            grown = self._growth.registered(self._pairs[k].tolist(), most=self._enough)
-            self._known_large[k] = int(grown.sum()) >= self._enough
+            grown = self._growth.registered(self._pairs[k].tolist(), max_images=self._large_size)
+            self._known_large[k] = int(grown.sum()) >= self._large_size
         return self._known_large[k]
 
 
-def _known_rotation(
-    models: Sequence[Sequence[_Floats | None]], pair: Sequence[int]
-) -> _Floats | None:
-    """The rotation from the first camera of a pair to the second; None if not known."""
+def are_far(pairs: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Whether the images of each pair, int32 [num_pairs, 2], are no neighbours."""
+    return np.asarray(pairs[:, 1] - pairs[:, 0] > NEIGHBOURS)
+
+
+def _known_pose(models: Sequence[Sequence[_Floats | None]], pair: Sequence[int]) -> _Floats | None:
+    """The pose of the second camera relative to the first, float64 [3, 4]; None if not known.
+
+    The translation has length 1.
+    """
     for cam_from_world in models:
         first, second = (cam_from_world[image] for image in pair)
         if first is not None and second is not None:
-            return np.asarray(second[:, :3] @ first[:, :3].T)
+            rotation = second[:, :3] @ first[:, :3].T
+            step = second[:, 3] - rotation @ first[:, 3]
+            return np.column_stack([rotation, step / max(float(np.linalg.norm(step)), 1e-12)])
     return None
 
 

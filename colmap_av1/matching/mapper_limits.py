@@ -17,8 +17,8 @@ LOWER_INITIAL_LIMITS = {
     "init_min_num_inliers": INITIAL_MIN_INLIERS // 2,
     "init_min_tri_angle": INITIAL_MIN_ANGLE / 2,
 }
-# If no pair has that angle, the mapper halves it twice. Before that, it tries hundreds or thousands
-# of pairs, and begins with the first to which RANSAC gives a wrong pose with a large angle.
+# If no pair has 8 degrees either, the mapper halves the angle again. Before that, it tries hundreds
+# or thousands of pairs, and RANSAC may give one of them a wrong pose with a large angle.
 INITIAL_LEAST_ANGLE = INITIAL_MIN_ANGLE / 4
 # Fewest points that an image must observe to be registered (abs_pose_min_num_inliers), and smallest
 # triangulation angle of a point in degrees (filter_min_tri_angle).
@@ -31,7 +31,8 @@ class InitialLimits:
     """Limits of the initial pair, by the names of the options of COLMAP's mapper.
 
     Attributes:
-        init_max_forward_motion: largest share of the translation along the optical axis, below 1.
+        init_max_forward_motion: largest share of the translation along the optical axis; 1 excludes
+            no pair.
         init_min_tri_angle: smallest triangulation angle in degrees.
     """
 

@@ -19,7 +19,7 @@ import pycolmap
 
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import NEIGHBOURS, PreparedStart, demoted
+from colmap_av1.matching.initial_pairs import PreparedStart, are_far, demoted
 from colmap_av1.matching.mapper_limits import (
     FORWARD_MOTION,
     LOWER_INITIAL_LIMITS,
@@ -44,12 +44,13 @@ def demote_failing_starts(
     cameras: Sequence[pycolmap.Camera],
     context: RunContext,
 ) -> MatchedImages:
-    """Limit the inliers of pairs from which COLMAP's incremental mapper starts a model in vain.
+    """Limit the inliers of pairs with which COLMAP's incremental mapper starts a small model.
 
-    The mapper runs with one thread and the seed 0, with the options that `match` prints, and also
-    without them. Other seeds and versions mostly start alike. If no pair meets the default limits
-    of an initial pair, the trials without options begin with the lower limits that the mapper tries
-    later, because it takes the mapper many seconds to find that no pair meets the first ones.
+    The mapper runs with one thread and the seed 0, with the options that `match` prints, and for
+    small angles also without them. Other seeds and versions mostly start alike. If no pair meets
+    the default limits of an initial pair, the trials without options begin with the lower limits
+    that the mapper tries later, because it takes many seconds to find that no pair meets the first
+    ones.
 
     Args:
         start: the images, and the mapper's limits.
@@ -93,9 +94,8 @@ def demote_failing_starts(
 
 def _tried_limits(start: PreparedStart) -> list[dict[str, float]]:
     """Limits of the initial pair for each series of trials."""
-    if not start.is_certain:
-        return [LOWER_INITIAL_LIMITS]
-    series = [start.limits.options]
+    lower = {} if start.is_certain else LOWER_INITIAL_LIMITS
+    series = [{**lower, **start.limits.options}]
     if start.limits == SMALL_ANGLES:
         series.append({} if start.may_meet_defaults else LOWER_INITIAL_LIMITS)
     return series
@@ -122,7 +122,7 @@ def _without_failing_starts(
         if failed is None:
             return found
         is_in = np.isin(matched.pairs, [names.index(name) for name in failed]).all(axis=1)
-        is_in &= np.diff(matched.pairs, axis=1)[:, 0] > NEIGHBOURS
+        is_in &= are_far(matched.pairs)
         geometries = [
             demoted(geometry) if demote else geometry
             for geometry, demote in zip(found.geometries, is_in.tolist(), strict=True)

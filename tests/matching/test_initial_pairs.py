@@ -12,7 +12,13 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pairs import prepare_start
-from colmap_av1.matching.mapper_limits import FORWARD_MOTION, INITIAL_MIN_INLIERS
+from colmap_av1.matching.mapper_limits import (
+    DEFAULT_LIMITS,
+    FORWARD_MOTION,
+    INITIAL_MIN_INLIERS,
+    SMALL_ANGLES,
+    InitialLimits,
+)
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.verify import verify_pairs
@@ -141,6 +147,24 @@ def test_pair_with_a_wrong_pose_is_demoted(
     assert is_kept or count < INITIAL_MIN_INLIERS / 2
     # The mapper needs options for forward motion only if it has no pair to start from.
     assert (found.limits == FORWARD_MOTION) == (forward_motion and not is_kept)
+
+
+@pytest.mark.parametrize(
+    ("angle", "limits", "is_certain"),
+    [(30.0, DEFAULT_LIMITS, True), (10.0, SMALL_ANGLES, True), (3.0, SMALL_ANGLES, False)],
+)
+def test_limits_depend_on_the_largest_angle(
+    angle: float, limits: InitialLimits, is_certain: bool
+) -> None:
+    keypoints, matches = two_views(4.0, np.random.default_rng(0), 400, angle)
+    geometry = verified(keypoints, matches)
+    turn = Rotation.from_euler("y", -angle / 2, degrees=True).as_matrix()
+    poses = [np.eye(3, 4), np.column_stack([turn, turn @ [-np.radians(angle), 0, 0]])]
+    matched = MatchedImages(keypoints, PAIR, [geometry.inlier_matches], [geometry], False)
+    found = prepare_start(matched, [CAMERA] * 2, Clock(), [poses])
+    assert found.limits == limits
+    assert found.is_certain == is_certain
+    assert found.matched.geometries[0] is geometry
 
 
 def test_wrong_pair_below_the_angle_of_a_good_pair_is_kept() -> None:
