@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from colmap_av1.errors import OptionError
+from colmap_av1.util.signals import held_back
 
 try:
     import fcntl
@@ -119,14 +120,16 @@ def whole_file(path: Path) -> Iterator[Path]:
         OSError: the file cannot be created or renamed, or another program wrote it meanwhile.
     """
     before = _version(path)
-    with _held(path, lambda partial: partial.touch(exist_ok=False), os.O_RDWR) as partial:
-        try:
-            yield partial
-            if _version(path) != before:
-                raise OSError(errno.EEXIST, "another program wrote it meanwhile", str(path))
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
+    with _held(
+        path,
+        make=lambda partial: partial.touch(exist_ok=False),
+        how=os.O_RDWR,
+        remove=lambda partial: partial.unlink(missing_ok=True),
+    ) as partial:
+        yield partial
+        if _version(path) != before:
+            raise OSError(errno.EEXIST, "another program wrote it meanwhile", str(path))
+        partial.replace(path)
 
 
 @contextmanager
@@ -256,15 +259,19 @@ def _hidden(path: Path) -> Path:
 
 @contextmanager
 def _hidden_folder(path: Path) -> Iterator[Path]:
-    with _held(path, lambda partial: partial.mkdir(parents=True), os.O_RDONLY) as partial:
-        try:
-            yield partial
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+    with _held(
+        path,
+        make=lambda partial: partial.mkdir(parents=True),
+        how=os.O_RDONLY,
+        remove=lambda partial: shutil.rmtree(partial, ignore_errors=True),
+    ) as partial:
+        yield partial
 
 
 @contextmanager
-def _held(path: Path, make: Callable[[Path], None], how: int) -> Iterator[Path]:
+def _held(
+    path: Path, make: Callable[[Path], None], how: int, remove: Callable[[Path], None]
+) -> Iterator[Path]:
     """Create a hidden file or folder next to a path and lock it, if the system has locks.
 
     Before it is locked, another process may remove it as a leftover. It is then created again.
@@ -273,23 +280,27 @@ def _held(path: Path, make: Callable[[Path], None], how: int) -> Iterator[Path]:
         path: the path.
         make: creates the file or folder.
         how: flags to open it with.
+        remove: removes it after the body, if it still exists.
     """
     while True:
-        partial = _hidden(path)
-        make(partial)
-        if fcntl is None:
-            yield partial
-            return
+        partial, descriptor, is_made = _hidden(path), None, False
         try:
-            descriptor = os.open(partial, how)
-        except FileNotFoundError:
-            continue
-        try:
-            if _lock(descriptor) and partial.exists():
+            with held_back():  # an interrupt right after `make` must not leave the file
+                make(partial)
+                is_made = True
+            if fcntl is None:
+                yield partial
+                return
+            with contextlib.suppress(FileNotFoundError):
+                descriptor = os.open(partial, how)
+            if descriptor is not None and _lock(descriptor) and partial.exists():
                 yield partial
                 return
         finally:
-            os.close(descriptor)
+            if is_made:
+                remove(partial)
+            if descriptor is not None:
+                os.close(descriptor)
 
 
 def _lock(descriptor: int) -> bool:

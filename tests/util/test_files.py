@@ -85,6 +85,20 @@ def test_folder_appears_when_complete(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["new"]
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no locks")
+@pytest.mark.parametrize("write", [whole_file, whole_folder, scratch_folder])
+def test_interrupt_before_the_body_leaves_nothing(
+    write: Callable[[Path], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(_: int) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("colmap_av1.util.files._lock", interrupt)
+    with pytest.raises(KeyboardInterrupt), write(tmp_path / "output"):
+        pytest.fail("the body runs")
+    assert not list(tmp_path.iterdir())
+
+
 def test_existing_folder_is_filled(tmp_path: Path) -> None:
     output = tmp_path / "model"
     output.mkdir()
