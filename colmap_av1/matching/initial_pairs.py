@@ -42,6 +42,9 @@ _ALONG_MARGIN = 0.02
 # this many pairs.
 _LARGE = 0.8
 _NUM_GROWN = 16
+# A mapper with several threads tries up to this many images at a time. With some, it may have tried
+# twice as many pairs as with the first one, and this many more.
+_NUM_THREADS, _NUM_AHEAD = 16, 4
 # Neighbours are at most this many images apart. They connect the images, and are only demoted if
 # their pose is wrong.
 NEIGHBOURS = 2
@@ -262,30 +265,44 @@ class _Search:
             count = found.count.copy()
             count[list(early)] = _MIN_INLIERS - 1
             num_before = len(early)
-            for k in self._order(count):
+            order, rank, place = self._order(count)
+            first = None  # the first certain pair, as a place in the order
+            for i, k in enumerate(order.tolist()):
                 if not possible[k] or count[k] < INITIAL_MIN_INLIERS:
                     continue
-                if is_sound[k] and self._is_large(k):
-                    if certain[k]:
+                if first is not None:
+                    if rank[i] >= rank[first] + _NUM_THREADS:
                         break
-                elif found.is_far[k]:
-                    early.add(k)
-            else:
+                    if rank[i] == rank[first] or place[i] > 2 * place[first] + _NUM_AHEAD:
+                        continue
+                if not is_sound[k] or not self._is_large(k):
+                    early |= {k} if found.is_far[k] else set()
+                elif certain[k] and first is None:
+                    first = i
+            if first is None:
                 return None
             if len(early) == num_before:
                 return early
 
-    def _order(self, count: NDArray[np.int64]) -> list[int]:
+    def _order(
+        self, count: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """The pairs in the order in which the mapper tries them.
 
         It tries the images by their number of matches, each with all others by the number of
-        matches in common. With several threads, COLMAP 4.2 tries several images at a time, and may
-        begin with a pair that comes somewhat later.
+        matches in common. COLMAP 4.2 tries several images at a time if it has several threads, and
+        begins with the pair that it finds first.
+
+        Returns:
+            int64 [num_pairs] the pairs, the rank of the image with which each is tried, and its
+            place among the pairs of that image.
         """
         total = np.bincount(self._pairs.ravel(), np.repeat(count, 2))
-        rank = np.argsort(np.argsort(-total, kind="stable"))
-        order: list[int] = np.lexsort((-count, rank[self._pairs].min(axis=1))).tolist()
-        return order
+        rank_of = np.argsort(np.argsort(-total, kind="stable"))
+        rank = rank_of[self._pairs].min(axis=1)
+        order = np.lexsort((-count, rank))
+        rank = rank[order]
+        return order, rank, np.arange(len(rank)) - np.searchsorted(rank, rank)
 
     def _is_large(self, k: int) -> bool:
         """Whether a large model grows from a pair."""
