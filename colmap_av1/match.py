@@ -30,10 +30,7 @@ from colmap_av1.matching.gaps import fast_frames, matching_warnings
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.initial_pairs import prepare_start
 from colmap_av1.matching.links.report import LinkReport
-from colmap_av1.matching.mapper_limits import (
-    FORWARD_MOTION,
-    SMALL_ANGLES,
-)
+from colmap_av1.matching.mapper_limits import FORWARD_MOTION, SMALL_ANGLES
 from colmap_av1.matching.match_images import (
     ImageMatches,
     ImageMatchOptions,

@@ -327,8 +327,7 @@ def motion_findings(
         yield Finding(
             "warning",
             "the camera moves along its axis: the incremental mapper starts only with "
-            f"{' '.join(FORWARD_MOTION.words)}, and the focal length is not "
-            "observable",
+            f"{' '.join(FORWARD_MOTION.words)}, and the focal length is not observable",
         )
 
 

@@ -57,9 +57,10 @@ class Growth:
         views = np.repeat(np.arange(len(cameras)), np.diff(self._offsets))
         self._rays = np.full((len(views), 3), np.nan)
         self._model_of = np.full(len(cameras), -1)
-        placed = [(m, i, p) for m, poses in enumerate(known) for i, p in enumerate(poses)]
-        for number, i, pose in placed:
-            if pose is not None:
+        for number, poses in enumerate(known):
+            for i, pose in enumerate(poses):
+                if pose is None:
+                    continue
                 self._model_of[i] = number
                 x = np.asarray(cameras[i].cam_from_img(matched.keypoints[i].xy.astype(float)))
                 rays = np.column_stack([x, np.ones(len(x))]) @ pose[:, :3]

@@ -275,9 +275,10 @@ class _Search:
                         break
                     if rank[i] == rank[first] or place[i] > 2 * place[first] + _NUM_AHEAD:
                         continue
-                if not is_sound[k] or not self._is_large(k):
-                    early |= {k} if found.is_far[k] else set()
-                elif certain[k] and first is None:
+                is_good = is_sound[k] and self._is_large(k)
+                if not is_good and found.is_far[k]:
+                    early.add(k)
+                elif is_good and certain[k] and first is None:
                     first = i
             if first is None:
                 return None

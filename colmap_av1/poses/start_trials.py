@@ -20,11 +20,7 @@ import pycolmap
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pairs import PreparedStart, are_far, demoted
-from colmap_av1.matching.mapper_limits import (
-    FORWARD_MOTION,
-    LOWER_INITIAL_LIMITS,
-    SMALL_ANGLES,
-)
+from colmap_av1.matching.mapper_limits import FORWARD_MOTION, LOWER_INITIAL_LIMITS, SMALL_ANGLES
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
 from colmap_av1.util.run_context import RunContext
