@@ -15,9 +15,12 @@ PAUSE = range(12, 42)
 
 
 @pytest.mark.shared
-def test_tracks_continue_through_a_pause(shared: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+@pytest.mark.parametrize("noise", [0, 3])
+def test_tracks_continue_through_a_pause(
+    shared: Path, ffmpeg: Ffmpeg, tmp_path: Path, noise: int
+) -> None:
     clip = shared / "sequences" / "ditch" / "clip.mp4"
-    filters = f"loop=loop={len(PAUSE) - 1}:size=1:start={PAUSE[0]},noise=alls=3:allf=t"
+    filters = f"loop=loop={len(PAUSE) - 1}:size=1:start={PAUSE[0]},noise=alls={noise}:allf=t"
     lossy = ("-frames:v", "54", "-c:v", "libx264", "-preset", "fast", "-crf", "20")
     encode(ffmpeg("-i", clip, "-vf", filters, *lossy, tmp_path / "h.mp4"), tmp_path / "a.mp4")
 

@@ -412,6 +412,27 @@ def test_largest_blocks_are_tracked_if_the_whole_frame_moves_alike(
     assert count(0, detail=0) == 0
 
 
+def test_largest_blocks_are_tracked_in_repeats_of_a_picture_with_detail() -> None:
+    def count(*, detail: bool, coded: bool = False) -> int:
+        """Number of tracks through five frames that repeat the first one.
+
+        If `coded`, the third frame has a residual.
+        """
+        still = np.zeros((48, 64, 2), np.int16)
+        frames = low_delay([still] * 5, width=256, height=192, mi_size=BLOCK_64X64)
+        for one in frames:
+            units(one)["skip"] = 1
+        if detail:
+            units(frames[0])["mi_size"] = BLOCK_16X16
+        if coded:
+            units(frames[2])["skip"] = 0
+        return build_tracks(frames, SMALL_PICTURES).num_tracks
+
+    assert count(detail=True) > 0.8 * 48 * 64
+    assert count(detail=True, coded=True) == 0
+    assert count(detail=False) == 0
+
+
 def test_hidden_frames_continue_tracks_without_observations() -> None:
     step = (0.5, 0.25)
     frames = [

@@ -75,11 +75,17 @@ bool TrackBuilder::is_waiting(int display_index) const {
 }
 
 ChainedFrame& TrackBuilder::read_frame(const FrameMotion& coded) {
+  RefDetail ref_has_detail{};
+  for (int ref = 1; ref < kNumRefs; ++ref) {
+    ref_has_detail[ref] = std::ranges::any_of(frames_, [&](const auto& frame) {
+      return frame->motion.decode_index == coded.ref_decode_index[ref] && frame->motion.has_detail;
+    });
+  }
   if (idle_frames_.empty()) idle_frames_.push_back(std::make_unique<ChainedFrame>());
   frames_.push_back(std::move(idle_frames_.back()));
   idle_frames_.pop_back();
   ChainedFrame& frame = *frames_.back();
-  read_trusted_motion(coded, options_, scratch_, frame.motion);
+  read_trusted_motion(coded, options_, ref_has_detail, scratch_, frame.motion);
   frame.order = -1;
   frame.cell_rows = grid_.cells * frame.motion.rows;
   frame.cell_cols = grid_.cells * frame.motion.cols;

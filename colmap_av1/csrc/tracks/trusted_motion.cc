@@ -23,9 +23,12 @@ using Verdict = TrustScratch::Verdict;
 // Approximate number of sampled units that decide whether a frame moves evenly.
 constexpr int kEvenSamples = 2048;
 constexpr int kSuperblock = 16;  // in units; the smaller of the two sizes
-// If a smaller share of the sampled units is in small blocks, the picture shows no detail. For a
-// camera that stands still, without noise, the share is 0.02.
+// If a smaller share of the sampled units is in small blocks, the picture shows no detail, or it
+// repeats another one exactly. For a camera that stands still, the share is at least 0.02.
 constexpr double kDetail = 0.01;
+// A picture repeats the one that it refers to if at most this share of the sampled units has a
+// residual. If it shows something else without detail, such as black, all of them have one.
+constexpr double kRepeat = 0.2;
 
 // How the motion of the units around a block compares with that of the block.
 struct Agreement {
@@ -97,28 +100,35 @@ TimedMotion timed(const TrustedMotion& motion, Point at, const Displacement& d) 
   return {{at.x, at.y, d.dx, d.dy}, motion.ref_interval[d.ref]};
 }
 
-// The even motion in the frame's first list. There is none if all blocks are small enough, if fewer
-// than half of the sampled units have motion, or if hardly any blocks are small: a picture of one
-// colour seems to stand still.
+// The even motion in the frame's first list, and whether the frame shows detail. There is no even
+// motion if all blocks are small enough, if fewer than half of the sampled units have motion, or
+// without detail: a picture of one colour seems to stand still.
 EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
-                       const DisplacementModel& model, const TrustedMotion& motion) {
+                       const DisplacementModel& model, const RefDetail& ref_has_detail,
+                       TrustedMotion& motion) {
   const int step = std::max(1, static_cast<int>(std::sqrt(frame.num_units() / kEvenSamples)));
   int num_small = 0;
   int num_large = 0;
+  int num_coded = 0;
+  std::array<int, kNumRefs> num_linked{};
   std::vector<TimedMotion> spread;
   // Blocks in partial superblocks are excluded, because they are small for lack of space.
   for (int row = step / 2; row < motion.visible_rows / kSuperblock * kSuperblock; row += step) {
     for (int col = step / 2; col < motion.visible_cols / kSuperblock * kSuperblock; col += step) {
       const int unit = row * motion.cols + col;
-      const bool small =
-          is_small_enough(options, motion.block_area(unit), frame.block(unit).skip == 0);
-      ++(small ? num_small : num_large);
+      const bool coded = frame.block(unit).skip == 0;
+      ++(is_small_enough(options, motion.block_area(unit), coded) ? num_small : num_large);
+      num_coded += coded ? 1 : 0;
       const Displacement d = model.at(unit, 0);
+      ++num_linked[d.ref];
       if (d.ref != 0) spread.push_back(timed(motion, motion.unit_centre(unit), d));
     }
   }
   const int num_units = num_small + num_large;
-  if (num_large == 0 || num_small < kDetail * num_units || 2 * std::ssize(spread) < num_units) {
+  const auto main_ref = std::ranges::max_element(num_linked) - num_linked.begin();
+  const bool repeats = num_coded <= kRepeat * num_units && ref_has_detail[main_ref];
+  motion.has_detail = num_small >= kDetail * num_units || repeats;
+  if (num_large == 0 || !motion.has_detail || 2 * std::ssize(spread) < num_units) {
     spread.clear();
   }
   return {spread, motion.coded_width, motion.height};
@@ -127,9 +137,9 @@ EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& opti
 // Reads the displacements of visible units that are trusted by the rules that do not compare a unit
 // with its neighbours.
 void read_displacements(const FrameMotion& frame, const TrackBuilderOptions& options,
-                        TrustedMotion& motion) {
+                        const RefDetail& ref_has_detail, TrustedMotion& motion) {
   const DisplacementModel model(frame);
-  const EvenMotion even = even_motion(frame, options, model, motion);
+  const EvenMotion even = even_motion(frame, options, model, ref_has_detail, motion);
   const auto border = static_cast<float>(options.border.value_or(0));
   for (int row = 0; row < motion.visible_rows; ++row) {
     for (int col = 0; col < motion.visible_cols; ++col) {
@@ -261,10 +271,11 @@ int TrustedMotion::block_area(int unit) const {
 }
 
 void read_trusted_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
-                         TrustScratch& scratch, TrustedMotion& motion) {
+                         const RefDetail& ref_has_detail, TrustScratch& scratch,
+                         TrustedMotion& motion) {
   read_frame_values(frame, motion);
   keep_warps(frame, motion);
-  read_displacements(frame, options, motion);
+  read_displacements(frame, options, ref_has_detail, motion);
   judge_blocks(frame, options, scratch, motion);
   const auto limit = [](std::optional<double> value) {
     return static_cast<float>(value.value_or(0));

@@ -41,6 +41,7 @@ struct TrustedMotion {
   std::array<int, kNumRefs> num_linked{};  // number of entries of the lists, by ref
   std::vector<av1::WarpParams> warps;
   std::vector<std::uint8_t> mi_size;
+  bool has_detail = false;  // whether the picture shows any detail
 
   std::span<std::vector<UnitMotion>> used_lists() { return std::span(lists).first(num_lists); }
   std::span<const std::vector<UnitMotion>> used_lists() const {
@@ -75,10 +76,14 @@ struct TrustScratch {
   std::vector<UnitMotion> unfilled;
 };
 
+// Whether the frame behind each RefFrame shows any detail; false for those without a frame.
+using RefDetail = std::array<bool, kNumRefs>;
+
 // Copies the motion of a coded frame that is trusted by the rules of `options`. Overwrites
 // `motion`, whose memory is reused. The frame must have passed check_frame_motion.
 void read_trusted_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
-                         TrustScratch& scratch, TrustedMotion& motion);
+                         const RefDetail& ref_has_detail, TrustScratch& scratch,
+                         TrustedMotion& motion);
 
 inline bool moves_alike(const UnitMotion& a, const UnitMotion& b, float limit) {
   return distance({a.dx, a.dy}, {b.dx, b.dy}) < limit;
