@@ -43,8 +43,14 @@ _NUM_IMAGES = 16
 # Long-range epipolar error in pixels (90th percentile) above which there is a warning. Good models
 # have less than one, or two with long focal lengths.
 _MAX_ERROR = 4.0
-# Smallest number of pairs, all without matches, for which there is a warning.
-_MIN_TRIED = 3
+# Fewest matches of a pair that has an error. The geometry of 20 matches may be wrong.
+_MIN_MATCHES = 30
+# Smallest number of pairs, all without matches, for which there is a warning. Sharp images, which
+# have at least this number of features, only count up to this angle: those of plants have few
+# matches beyond it.
+_MIN_IN_VAIN = 3
+_SHARP_FEATURES = 200
+_SHARP_ANGLE = 15.0
 
 
 @dataclass(frozen=True)
@@ -52,16 +58,17 @@ class LongRangeErrors:
     """Result of the long-range check.
 
     Attributes:
-        pairs: (name, name) of the images of each pair with matches.
+        pairs: (name, name) of the images of each pair with enough matches.
         error: float64 [num_pairs] long-range epipolar error of each pair: median distance in pixels
             of its matches from the epipolar lines of the poses.
-        num_tried: number of pairs that overlap by their poses and were matched.
-        num_features: median number of features of their images; 0 if there are none.
+        num_in_vain: number of pairs that should have matches by their poses, if none has any;
+            otherwise 0.
+        num_features: median number of features of the images; 0 if there are none.
     """
 
     pairs: tuple[tuple[str, str], ...]
     error: _Floats
-    num_tried: int
+    num_in_vain: int
     num_features: int
 
     @property
@@ -90,9 +97,9 @@ class LongRangeErrors:
         Args:
             linked: whether loop closures have been searched.
         """
-        if not self.pairs and self.num_tried >= _MIN_TRIED:
+        if self.num_in_vain >= _MIN_IN_VAIN:
             return (
-                f"{self.num_tried} pairs of images far apart in time overlap by their poses but "
+                f"{self.num_in_vain} pairs of images far apart in time overlap by their poses but "
                 f"show nothing in common, with {self.num_features} features per image where sharp "
                 "ones have hundreds: the images are blurred or lack texture, or the poses are wrong"
             )
@@ -123,7 +130,7 @@ class LongRangeCheck:
     ) -> None:
         self._images = images
         self._cameras = [cameras[image.camera_id] for image in images]
-        self._pairs = _far_pairs(images, self._cameras, points_of)
+        self._pairs, self._angles = _far_pairs(images, self._cameras, points_of)
         self._wanted = set(self._pairs.ravel().tolist())
         self._features: dict[int, Features] = {}
 
@@ -157,17 +164,20 @@ class LongRangeCheck:
         )
         names, errors = [], []
         for (i, j), geometry in zip(found.pairs.tolist(), found.geometries, strict=True):
+            if len(geometry.inlier_matches) < _MIN_MATCHES:
+                continue
             a, b = geometry.inlier_matches.T
             error = self._errors(i, j, features[i].xy[a], features[j].xy[b])
             if len(error):
                 names.append((self._images[i].name, self._images[j].name))
                 errors.append(float(np.median(error)))
-        sizes = [len(own.xy) for own in features.values()]
+        num_features = int(np.median([len(own.xy) for own in features.values()] or [0]))
+        should_match = (self._angles <= _SHARP_ANGLE) | (num_features < _SHARP_FEATURES)
         return LongRangeErrors(
             tuple(names),
             np.array(errors),
-            num_tried=len(self._pairs),
-            num_features=int(np.median(sizes)) if sizes else 0,
+            num_in_vain=0 if len(found.pairs) else int(should_match.sum()),
+            num_features=num_features,
         )
 
     def _errors(
@@ -231,35 +241,43 @@ def _far_pairs(
     images: Sequence[ModelImage],
     cameras: Sequence[pycolmap.Camera],
     points_of: Callable[[int], _Floats],
-) -> NDArray[np.int32]:
+) -> tuple[NDArray[np.int32], _Floats]:
     """Choose a few pairs of images that are far apart in time and overlap by their poses.
 
     Returns:
-        int32 [n, 2], first < second: first the longest spans, then others spread over the images.
+        int32 [n, 2], first < second: first the longest spans, then others spread over the images;
+        and float64 [n] the viewing angle of each, see `_viewing_angle`.
     """
     num_images = len(images)
     if num_images <= GAP:
-        return np.empty((0, 2), np.int32)
+        return np.empty((0, 2), np.int32), np.empty(0)
     poses = np.array([image.cam_from_world for image in images])
     chosen = evenly_spread(num_images, _NUM_IMAGES)
-    found = []
+    found: list[tuple[int, int, float]] = []
     for i in chosen:
         points = points_of(i)
         points = points[:: max(1, len(points) // _NUM_POINTS)]
-        later = (j for j in reversed(chosen) if j >= i + GAP)
-        partner = next((j for j in later if _sees_same(points, poses[[i, j]], cameras[j])), None)
-        if partner is not None:
-            found.append((i, partner))
+        for j in reversed(chosen):
+            angle = _viewing_angle(points, poses[[i, j]], cameras[j]) if j >= i + GAP else None
+            if angle is not None:
+                found.append((i, j, angle))
+                break
     found.sort(key=lambda pair: (pair[0] - pair[1], pair[0]))
     half = _NUM_PAIRS // 2
-
     rest = sorted(found[half:])
     spread = rest[:: max(1, -(-len(rest) // half))] if rest else []
-    return np.array(found[:half] + spread[:half], dtype=np.int32).reshape(-1, 2)
+    pairs = found[:half] + spread[:half]
+    return (
+        np.array([pair[:2] for pair in pairs], np.int32).reshape(-1, 2),
+        np.array([angle for *_, angle in pairs]),
+    )
 
 
-def _sees_same(points: _Floats, poses: _Floats, camera: pycolmap.Camera) -> bool:
-    """Whether the second image sees most of the points of the first from a similar viewpoint.
+def _viewing_angle(points: _Floats, poses: _Floats, camera: pycolmap.Camera) -> float | None:
+    """Median angle in degrees between the directions in which two images see the same points.
+
+    Returns None if the second image does not see most of the points of the first, or if the angle
+    or the ratio of the distances is too large.
 
     Args:
         points: float64 [n, 3] points that the first image observes.
@@ -269,13 +287,15 @@ def _sees_same(points: _Floats, poses: _Floats, camera: pycolmap.Camera) -> bool
     local = points @ poses[1, :, :3].T + poses[1, :, 3]
     local = local[local[:, 2] > 0]
     if len(local) < _MIN_OVERLAP * len(points) or len(local) == 0:
-        return False
+        return None
     x, y = np.asarray(camera.img_from_cam(local)).T
     inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     if np.count_nonzero(inside) < _MIN_OVERLAP * len(points):
-        return False
+        return None
     rays = [points - centre for centre in camera_centres(poses)]
     near, far = (np.linalg.norm(ray, axis=1) for ray in rays)
     cosine = np.median(np.sum(rays[0] * rays[1], axis=1) / np.maximum(near * far, 1e-12))
+    angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     scale = np.median(near / np.maximum(far, 1e-12))
-    return bool(cosine >= np.cos(np.radians(_MAX_ANGLE)) and 1 / _MAX_SCALE <= scale <= _MAX_SCALE)
+    is_similar = angle <= _MAX_ANGLE and 1 / _MAX_SCALE <= scale <= _MAX_SCALE
+    return angle if is_similar else None
