@@ -98,6 +98,9 @@ class MatchReport:
             observable.
         small_angles: the joint estimate shows that the mapper needs a lower limit of the
             triangulation angle to begin with a pair from which a large model grows.
+        fixed_intrinsics: the mapper should not refine focal length and distortion, because the
+            camera moves along its axis, or because the joint estimate shows that the images hardly
+            determine them. They may diverge otherwise, so that few images register.
         links: SIFT links between images that motion does not connect.
         estimate: summary of the joint estimate of all poses that matches were verified against;
             None if they were verified pair by pair.
@@ -128,6 +131,7 @@ class MatchReport:
     configs: dict[str, int]
     forward_motion: bool
     small_angles: bool
+    fixed_intrinsics: bool
     links: LinkReport
     estimate: JointEstimate | None
     seconds: dict[str, float]
@@ -137,7 +141,11 @@ class MatchReport:
     def map_options(self) -> MapOptions:
         """Options for `map_database` with which the incremental mapper starts well."""
         angle = SMALL_ANGLES.init_min_tri_angle if self.small_angles else None
-        return MapOptions(forward_motion=self.forward_motion, init_min_tri_angle=angle)
+        return MapOptions(
+            forward_motion=self.forward_motion,
+            init_min_tri_angle=angle,
+            refine_intrinsics=False if self.fixed_intrinsics else None,
+        )
 
     @property
     def next_commands(self) -> tuple[str, str, str]:
@@ -162,15 +170,17 @@ class MatchReport:
             "--output", output,
         ]
         if self.forward_motion:
-            mapper += [
-                *FORWARD_MOTION.words,
-                "--Mapper.ba_refine_focal_length", "0",
-                "--Mapper.ba_refine_extra_params", "0",
-            ]
+            mapper += FORWARD_MOTION.words
             ours.append("--forward_motion")
         elif self.small_angles:
             mapper += SMALL_ANGLES.words
             ours += ["--init_min_tri_angle", f"{SMALL_ANGLES.init_min_tri_angle:g}"]
+        if self.fixed_intrinsics:
+            mapper += [
+                "--Mapper.ba_refine_focal_length", "0",
+                "--Mapper.ba_refine_extra_params", "0",
+            ]
+            ours += ["--refine_intrinsics", "0"]
         densify = [
             "colmap-av1", "densify",
             "--model", f"{output}/0",
@@ -266,11 +276,16 @@ def match(
         has_focal_lengths = all(camera.has_prior_focal_length for camera in found.cameras)
         known = found.poses if isinstance(found, JointMatches) and has_focal_lengths else ()
         start = prepare_start(found.matched, found.cameras, clock, known)
+        # The estimate does not change the cameras of an existing database.
+        is_undetermined = cameras is None and _has_guessed_focal_length(found)
+        fixed_intrinsics = start.limits == FORWARD_MOTION or is_undetermined
         written = start.matched
         names = images.image_set.images.names
         crash = None
         try:
-            written = demote_failing_starts(start, names, found.cameras, context)
+            written = demote_failing_starts(
+                start, names, found.cameras, context, fixed_intrinsics=fixed_intrinsics
+            )
         except ModelError:
             crash = (
                 "COLMAP's mapper failed in a trial on this database, and may fail again: if so, "
@@ -331,6 +346,7 @@ def match(
         configs=dict(sorted(kinds.items())),
         forward_motion=start.limits == FORWARD_MOTION,
         small_angles=start.limits == SMALL_ANGLES,
+        fixed_intrinsics=fixed_intrinsics,
         links=found.links,
         estimate=found.estimate if isinstance(found, JointMatches) else None,
         seconds=clock.seconds,
@@ -495,6 +511,16 @@ def _match_images(
         return found
     warning = f"matches are verified pair by pair, without a joint estimate: {reason}"
     return replace(found, warnings=(*found.warnings, warning))
+
+
+def _has_guessed_focal_length(found: ImageMatches) -> bool:
+    """Whether a joint estimate registers images whose focal length it does not determine."""
+    return isinstance(found, JointMatches) and any(
+        not camera.has_prior_focal_length
+        for poses in found.poses
+        for camera, pose in zip(found.cameras, poses, strict=True)
+        if pose is not None
+    )
 
 
 def _has_several_cameras(image_set: ImageSet, cameras: ImageCameras) -> bool:

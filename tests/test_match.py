@@ -31,6 +31,7 @@ from colmap_av1.errors import (
 )
 from colmap_av1.images.files import alone_in, write_images
 from colmap_av1.images.names import image_names
+from colmap_av1.map import map_database
 from colmap_av1.match import match
 from colmap_av1.options import (
     CameraOptions,
@@ -502,6 +503,24 @@ def test_hidden_frames_are_matched_in_display_order(encode: Encode, tmp_path: Pa
 
 
 @pytest.mark.shared
+def test_focal_length_that_a_short_clip_does_not_determine_is_kept(
+    shared: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """If the mapper refined the focal length, it would diverge after two to five images."""
+    clip = shared / "sequences" / "log_building" / "clip.mp4"
+    short = ffmpeg("-i", clip, "-frames:v", "8", "-c:v", "copy", tmp_path / "short.mp4")
+    report = match(tmp_path / "a.db", short, image_path=tmp_path / "frames")
+    assert report.fixed_intrinsics
+    assert "--Mapper.ba_refine_focal_length 0" in report.next_commands[0]
+    assert "--refine_intrinsics 0" in report.next_commands[1]
+    options = replace(report.map_options, num_threads=1)
+    mapped = map_database(
+        tmp_path / "a.db", tmp_path / "frames", tmp_path / "models", options=options
+    )
+    assert mapped.num_registered == (8,)
+
+
+@pytest.mark.shared
 def test_forward_motion_is_detected(
     encode: Encode, clip: Path, shared: Path, tmp_path: Path
 ) -> None:
@@ -513,6 +532,7 @@ def test_forward_motion_is_detected(
     assert report.forward_motion
     assert "--Mapper.init_max_forward_motion 1" in report.next_commands[0]
     assert "--Mapper.init_min_tri_angle 4" in report.next_commands[0]
+    assert "--Mapper.ba_refine_focal_length 0" in report.next_commands[0]
     assert "--forward_motion" in report.next_commands[1]
 
     sideways = CameraOptions("PINHOLE", "200,200,96,64")

@@ -64,6 +64,8 @@ def match_rows(report: MatchReport) -> Rows:
         rows.append(("motion", "forward: the mapper needs the options below, and known intrinsics"))
     elif report.small_angles:
         rows.append(("triangulation angles", "small: the mapper starts well with the option below"))
+    if report.fixed_intrinsics and not report.forward_motion:
+        rows.append(("intrinsics", "hardly determined: the options below keep them fixed"))
     return [*rows, *_seconds_rows(report.seconds)]
 
 

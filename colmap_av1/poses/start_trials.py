@@ -39,6 +39,8 @@ def demote_failing_starts(
     names: Sequence[str],
     cameras: Sequence[pycolmap.Camera],
     context: RunContext,
+    *,
+    fixed_intrinsics: bool = False,
 ) -> MatchedImages:
     """Limit the inliers of pairs with which COLMAP's incremental mapper starts a small model.
 
@@ -53,6 +55,7 @@ def demote_failing_starts(
         names: names of the images.
         cameras: the camera of each image.
         context: its clock gets the stage "verification".
+        fixed_intrinsics: whether `match` prints that the mapper keeps the intrinsics.
 
     Returns:
         The images with fewer inliers; the given ones if no trial succeeds.
@@ -65,6 +68,7 @@ def demote_failing_starts(
     options = MapOptions(
         mapper="incremental",
         forward_motion=start.limits == FORWARD_MOTION,
+        refine_intrinsics=not fixed_intrinsics,
         seed=0,
         num_threads=1,
     )

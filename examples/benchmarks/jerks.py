@@ -335,7 +335,9 @@ def run_match(clip: Path, output: Path, camera: CameraOptions) -> list[str]:
     output.mkdir()
     options = MatchOptions(camera=camera, images=EVERY_FRAME)
     matched = match(output / "a.db", clip, image_path=output / "images", options=options)
-    settings = replace(matched.map_options, refine_intrinsics=camera.camera_params is None)
+    settings = matched.map_options
+    if camera.camera_params is not None:
+        settings = replace(settings, refine_intrinsics=False)
     mapped = map_database(output / "a.db", output / "images", output / "models", options=settings)
     missing = mapped.num_images - mapped.num_registered[0]
     parts = [f"{missing} images are not registered in folder 0"] if missing else []
