@@ -413,8 +413,8 @@ def test_largest_blocks_are_tracked_if_the_whole_frame_moves_alike(
 
 
 def test_largest_blocks_are_tracked_in_repeats_of_a_picture_with_detail() -> None:
-    def count(*, detail: bool, coded: bool = False) -> int:
-        """Number of tracks through five frames that repeat the first one.
+    def count(intra_size: int, *, coded: bool = False) -> int:
+        """Number of tracks through five frames that repeat a key frame with blocks of a size.
 
         If `coded`, the third frame has a residual.
         """
@@ -422,15 +422,15 @@ def test_largest_blocks_are_tracked_in_repeats_of_a_picture_with_detail() -> Non
         frames = low_delay([still] * 5, width=256, height=192, mi_size=BLOCK_64X64)
         for one in frames:
             units(one)["skip"] = 1
-        if detail:
-            units(frames[0])["mi_size"] = BLOCK_16X16
+        units(frames[0])["mi_size"] = intra_size
         if coded:
             units(frames[2])["skip"] = 0
         return build_tracks(frames, SMALL_PICTURES).num_tracks
 
-    assert count(detail=True) > 0.8 * 48 * 64
-    assert count(detail=True, coded=True) == 0
-    assert count(detail=False) == 0
+    assert count(BLOCK_16X16) > 0.8 * 48 * 64
+    assert count(BLOCK_16X16, coded=True) == 0
+    # As in a picture of a single colour.
+    assert count(BLOCK_32X32) == count(BLOCK_64X64) == 0
 
 
 def test_hidden_frames_continue_tracks_without_observations() -> None:

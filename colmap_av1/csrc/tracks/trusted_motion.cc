@@ -26,6 +26,8 @@ constexpr int kSuperblock = 16;  // in units; the smaller of the two sizes
 // If a smaller share of the sampled units is in small blocks, the picture shows no detail, or it
 // repeats another one exactly. For a camera that stands still, the share is at least 0.02.
 constexpr double kDetail = 0.01;
+// Intra blocks of this area show no detail either: encoders code even black in blocks of 32x32.
+constexpr int kPlainIntraArea = 1024;
 // A picture repeats the one that it refers to if at most this share of the sampled units has a
 // residual. If it shows something else without detail, such as black, all of them have one.
 constexpr double kRepeat = 0.2;
@@ -109,6 +111,7 @@ EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& opti
   const int step = std::max(1, static_cast<int>(std::sqrt(frame.num_units() / kEvenSamples)));
   int num_small = 0;
   int num_large = 0;
+  int num_detailed = 0;
   int num_coded = 0;
   std::array<int, kNumRefs> num_linked{};
   std::vector<TimedMotion> spread;
@@ -116,10 +119,13 @@ EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& opti
   for (int row = step / 2; row < motion.visible_rows / kSuperblock * kSuperblock; row += step) {
     for (int col = step / 2; col < motion.visible_cols / kSuperblock * kSuperblock; col += step) {
       const int unit = row * motion.cols + col;
+      const int area = motion.block_area(unit);
       const bool coded = frame.block(unit).skip == 0;
-      ++(is_small_enough(options, motion.block_area(unit), coded) ? num_small : num_large);
-      num_coded += coded ? 1 : 0;
+      const bool small = is_small_enough(options, area, coded);
       const Displacement d = model.at(unit, 0);
+      ++(small ? num_small : num_large);
+      num_detailed += small && (d.ref != 0 || area < kPlainIntraArea) ? 1 : 0;
+      num_coded += coded ? 1 : 0;
       ++num_linked[d.ref];
       if (d.ref != 0) spread.push_back(timed(motion, motion.unit_centre(unit), d));
     }
@@ -127,7 +133,7 @@ EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& opti
   const int num_units = num_small + num_large;
   const auto main_ref = std::ranges::max_element(num_linked) - num_linked.begin();
   const bool repeats = num_coded <= kRepeat * num_units && ref_has_detail[main_ref];
-  motion.has_detail = num_small >= kDetail * num_units || repeats;
+  motion.has_detail = num_detailed >= kDetail * num_units || repeats;
   if (num_large == 0 || !motion.has_detail || 2 * std::ssize(spread) < num_units) {
     spread.clear();
   }
