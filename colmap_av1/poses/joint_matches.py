@@ -93,7 +93,7 @@ class JointEstimate:
         num_registered: number of registered images of each model, the largest first. The other
             figures describe the first model.
         far_views: median long-range epipolar error in pixels, over pairs of images ten or more
-            apart; None if no such images overlap.
+            apart; None if no such images have enough matches.
         far_views_largest: its 90th percentile.
         moving: share of dynamic pixels, which have no matches.
         focal_lengths: the shortest and the longest focal length of the registered images in pixels.

@@ -73,7 +73,7 @@ class LongRangeErrors:
 
     @property
     def median(self) -> float | None:
-        """Median error over the pairs; None if no long-range pair has matches."""
+        """Median error over the pairs; None if no pair has enough matches."""
         return float(np.median(self.error)) if len(self.error) else None
 
     @property
@@ -83,7 +83,7 @@ class LongRangeErrors:
 
     @property
     def largest(self) -> float | None:
-        """90th percentile of the error over the pairs; None if no long-range pair has matches."""
+        """90th percentile of the error over the pairs; None if no pair has enough matches."""
         return float(np.quantile(self.error, 0.9)) if len(self.error) else None
 
     @property

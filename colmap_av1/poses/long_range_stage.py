@@ -35,7 +35,7 @@ class LongRangeResult:
 
     Attributes:
         far_views: median long-range epipolar error in pixels, over pairs of images ten or more
-            apart; None if no such images overlap.
+            apart; None if no such images have enough matches.
         far_views_largest: its 90th percentile.
         far_views_warning: warning about it.
         apart: whether the images contradict the poses.

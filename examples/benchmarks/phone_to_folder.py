@@ -127,7 +127,7 @@ def main() -> int:
     parser.add_argument(
         "--without_mapper",
         action="store_true",
-        help="stop SIFT after matching, for clips whose mapping takes hours",
+        help="leave out `match`, and stop SIFT after matching, for clips whose mapping takes hours",
     )
     add_results(parser, "phone_to_folder")
     arguments = parser.parse_args()
@@ -138,8 +138,9 @@ def main() -> int:
             clip = clip_of(name, folder)
             console.print(f"{name}: reconstruct", markup=False)
             rows, names = measure_ours(clip, folder / "reconstruct")
-            console.print(f"{name}: match", markup=False)
-            rows += measure_match(clip, folder / "match")
+            if not arguments.without_mapper:
+                console.print(f"{name}: match", markup=False)
+                rows += measure_match(clip, folder / "match")
             if not arguments.ours:
                 console.print(f"{name}: SIFT on {len(names)} images", markup=False)
                 mapped = not arguments.without_mapper

@@ -102,41 +102,57 @@ TimedMotion timed(const TrustedMotion& motion, Point at, const Displacement& d) 
   return {{at.x, at.y, d.dx, d.dy}, motion.ref_interval[d.ref]};
 }
 
-// The even motion in the frame's first list, and whether the frame shows detail. There is no even
-// motion if all blocks are small enough, if fewer than half of the sampled units have motion, or
-// without detail: a picture of one colour seems to stand still.
-EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
-                       const DisplacementModel& model, const RefDetail& ref_has_detail,
-                       TrustedMotion& motion) {
-  const int step = std::max(1, static_cast<int>(std::sqrt(frame.num_units() / kEvenSamples)));
-  int num_small = 0;
-  int num_large = 0;
-  int num_detailed = 0;
-  int num_coded = 0;
-  std::array<int, kNumRefs> num_linked{};
-  std::vector<TimedMotion> spread;
+// Calls `visit` with units that are spread over the picture.
+template <typename Visit>
+void visit_spread_units(const TrustedMotion& motion, const Visit& visit) {
+  const int num_units = motion.rows * motion.cols;
+  const int step = std::max(1, static_cast<int>(std::sqrt(num_units / kEvenSamples)));
   // Blocks in partial superblocks are excluded, because they are small for lack of space.
   for (int row = step / 2; row < motion.visible_rows / kSuperblock * kSuperblock; row += step) {
     for (int col = step / 2; col < motion.visible_cols / kSuperblock * kSuperblock; col += step) {
-      const int unit = row * motion.cols + col;
-      const int area = motion.block_area(unit);
-      const bool coded = frame.block(unit).skip == 0;
-      const bool small = is_small_enough(options, area, coded);
-      const Displacement d = model.at(unit, 0);
-      ++(small ? num_small : num_large);
-      num_detailed += small && (d.ref != 0 || area < kPlainIntraArea) ? 1 : 0;
-      num_coded += coded ? 1 : 0;
-      ++num_linked[d.ref];
-      if (d.ref != 0) spread.push_back(timed(motion, motion.unit_centre(unit), d));
+      visit(row * motion.cols + col);
     }
   }
-  const int num_units = num_small + num_large;
+}
+
+// Whether the picture shows any detail.
+bool shows_detail(const FrameMotion& frame, const TrackBuilderOptions& options,
+                  const DisplacementModel& model, const TrustedMotion& motion,
+                  const RefDetail& ref_has_detail) {
+  int num_units = 0;
+  int num_detailed = 0;
+  int num_coded = 0;
+  std::array<int, kNumRefs> num_linked{};
+  visit_spread_units(motion, [&](int unit) {
+    const int area = motion.block_area(unit);
+    const bool coded = frame.block(unit).skip == 0;
+    const int ref = model.at(unit, 0).ref;
+    ++num_units;
+    num_detailed += is_small_enough(options, area, coded) && (ref != 0 || area < kPlainIntraArea);
+    num_coded += coded;
+    ++num_linked[ref];
+  });
+  if (num_detailed >= kDetail * num_units) return true;
   const auto main_ref = std::ranges::max_element(num_linked) - num_linked.begin();
-  const bool repeats = num_coded <= kRepeat * num_units && ref_has_detail[main_ref];
-  motion.has_detail = num_detailed >= kDetail * num_units || repeats;
-  if (num_large == 0 || !motion.has_detail || 2 * std::ssize(spread) < num_units) {
-    spread.clear();
-  }
+  return num_coded <= kRepeat * num_units && ref_has_detail[main_ref];
+}
+
+// The even motion in the frame's first list. There is none if all blocks are small enough, if fewer
+// than half of the sampled units have motion, or without detail: a picture of one colour seems to
+// stand still.
+EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
+                       const DisplacementModel& model, const TrustedMotion& motion) {
+  int num_units = 0;
+  int num_large = 0;
+  std::vector<TimedMotion> spread;
+  visit_spread_units(motion, [&](int unit) {
+    const bool coded = frame.block(unit).skip == 0;
+    ++num_units;
+    num_large += !is_small_enough(options, motion.block_area(unit), coded);
+    const Displacement d = model.at(unit, 0);
+    if (d.ref != 0) spread.push_back(timed(motion, motion.unit_centre(unit), d));
+  });
+  if (num_large == 0 || !motion.has_detail || 2 * std::ssize(spread) < num_units) spread.clear();
   return {spread, motion.coded_width, motion.height};
 }
 
@@ -145,7 +161,8 @@ EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& opti
 void read_displacements(const FrameMotion& frame, const TrackBuilderOptions& options,
                         const RefDetail& ref_has_detail, TrustedMotion& motion) {
   const DisplacementModel model(frame);
-  const EvenMotion even = even_motion(frame, options, model, ref_has_detail, motion);
+  motion.has_detail = shows_detail(frame, options, model, motion, ref_has_detail);
+  const EvenMotion even = even_motion(frame, options, model, motion);
   const auto border = static_cast<float>(options.border.value_or(0));
   for (int row = 0; row < motion.visible_rows; ++row) {
     for (int col = 0; col < motion.visible_cols; ++col) {
