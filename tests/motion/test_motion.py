@@ -84,11 +84,11 @@ def test_result_does_not_depend_on_threads(
 def test_groups_are_read_by_several_threads(
     clips: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    used: set[int] = set()
+    used: set[threading.Thread] = set()  # their numbers are used again after they end
     parse = reading._parse
 
     def note_thread(*arguments: object) -> Iterator[object]:
-        used.add(threading.get_ident())
+        used.add(threading.current_thread())
         return parse(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(reading, "_parse", note_thread)
