@@ -174,7 +174,8 @@ def read_inputs(
     if options.masks.mask_path is None:
         return inputs
     counts = [count_shown(video) for video in videos]
-    masks = read_masks(Path(options.masks.mask_path), of_videos, counts)
+    names = [photo.name for photo in found]
+    masks = read_masks(Path(options.masks.mask_path), of_videos, counts, names)
     for photo in found:
         masks.of_photo(photo.name, photo.size)  # checks the size of the mask
     return replace(inputs, masks=masks)

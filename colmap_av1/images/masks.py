@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -132,16 +132,15 @@ class VideoMasks:
         return [self.of_frames[frame] for frame in chosen.frames.tolist()]
 
     def _named(self, names: Sequence[str]) -> list[Mask]:
-        found = [_mask_of(name, self.of_images or {}) for name in names]
-        masks = [mask for mask in found if mask is not None]
-        if len(masks) < len(names):
-            missing = next(n for n, mask in zip(names, found, strict=True) if mask is None)
+        masks = self.of_images or {}
+        found = {name: _mask_name(name, masks) for name in names}
+        missing = [name for name, mask in found.items() if mask is None]
+        if missing:
             raise ImageError(
-                f"{self.place}: holds {len(self.of_images or {})} masks, but lacks those of "
-                f"{len(names) - len(masks)} of {len(names)} images, such as "
-                f"'{missing}{_SUFFIX}': {_LAYOUTS}"
+                f"{self.place}: holds {len(masks)} masks, but lacks those of {len(missing)} of "
+                f"{len(names)} images, such as '{missing[0]}{_SUFFIX}': {_LAYOUTS}"
             )
-        return masks
+        return [masks[mask] for mask in found.values() if mask is not None]
 
 
 @dataclass(frozen=True)
@@ -153,7 +152,9 @@ class Masks:
         everywhere: the mask of all frames of all videos.
         of_frames: for videos with a mask for each frame, these masks by the folder of the video's
             images in the folder of all images.
-        of_images: all other masks, by their path in the folder without the extension .png.
+        of_images: all other masks of videos, by their path in the folder without the extension
+            .png.
+        of_photos: the masks of photos, by the name of the photo.
         digest: digest of all masks.
     """
 
@@ -161,6 +162,7 @@ class Masks:
     everywhere: Mask | None
     of_frames: Mapping[str, tuple[Mask, ...]]
     of_images: Mapping[str, Mask]
+    of_photos: Mapping[str, Mask]
     digest: str
 
     def of_video(self, label: str) -> VideoMasks | None:
@@ -180,7 +182,7 @@ class Masks:
         Raises:
             ImageError: the mask has another size.
         """
-        mask = _mask_of(name, self.of_images)
+        mask = self.of_photos.get(name)
         if mask is not None and mask.size != size:
             raise ImageError(
                 f"{self.path}: the mask of '{name}' is {mask.size[0]}x{mask.size[1]}, the photo "
@@ -189,12 +191,18 @@ class Masks:
         return mask
 
 
-def _mask_of(name: str, masks: Mapping[str, Mask]) -> Mask | None:
-    """The mask of an image 'a.jpg': 'a.jpg.png' as in COLMAP, else 'a.png' as in trainers."""
-    return masks.get(name) or masks.get(str(PurePosixPath(name).with_suffix("")))
+def _mask_name(image: str, masks: Collection[str]) -> str | None:
+    """Name of the mask of 'a.jpg': 'a.jpg' as in COLMAP, else 'a' as in trainers; None if missing.
+
+    The extension .png of masks is left out.
+    """
+    names = (image, str(PurePosixPath(image).with_suffix("")))
+    return next((name for name in names if name in masks), None)
 
 
-def read_masks(path: Path, labels: Sequence[str], num_frames: Sequence[int]) -> Masks:
+def read_masks(
+    path: Path, labels: Sequence[str], num_frames: Sequence[int], photos: Sequence[str] = ()
+) -> Masks:
     """Read the masks of videos and photos: one for all frames, of frames, or of images.
 
     Args:
@@ -203,6 +211,7 @@ def read_masks(path: Path, labels: Sequence[str], num_frames: Sequence[int]) -> 
             COLMAP's layout, `NAME.png`, or in that of trainers, where .png replaces the extension.
         labels: the folder of each video's images in the folder of all images.
         num_frames: number of frames of each video.
+        photos: names of the photos.
 
     Raises:
         ImageError: there is no such file or folder, a mask cannot be read, or all are black.
@@ -229,27 +238,39 @@ def read_masks(path: Path, labels: Sequence[str], num_frames: Sequence[int]) -> 
         name = "" if file == path else file.relative_to(path).as_posix()
         digest.update(f"{name} {mask.size} {len(mask.packed)} ".encode() + mask.packed)
     if path.is_file():
-        return Masks(path, masks[0], {}, {}, digest.hexdigest())
+        return Masks(path, masks[0], {}, {}, {}, digest.hexdigest())
     return _in_folder(
         path,
-        {f.relative_to(path).as_posix(): m for f, m in zip(files, masks, strict=True)},
+        {
+            file.relative_to(path).as_posix()[: -len(_SUFFIX)]: mask
+            for file, mask in zip(files, masks, strict=True)
+        },
         dict(zip(labels, num_frames, strict=True)),
+        photos,
         digest.hexdigest(),
     )
 
 
 def _in_folder(
-    path: Path, masks: dict[str, Mask], num_frames: dict[str, int], digest: str
+    path: Path,
+    masks: dict[str, Mask],
+    num_frames: dict[str, int],
+    photos: Sequence[str],
+    digest: str,
 ) -> Masks:
-    """Distinguish masks of frames from masks of images, by their names and number."""
+    """Distinguish masks of photos, of frames and of images, by their names and number."""
+    of_photos = {}
+    for photo in photos:
+        mask = _mask_name(photo, masks)
+        if mask is not None:
+            of_photos[photo] = masks.pop(mask)
     of_frames = {}
     for label, count in num_frames.items():
         own = [name for name in masks if PurePosixPath(name).parent == PurePosixPath(label)]
-        for_images = any(PurePosixPath(name).with_suffix("").suffix in READABLE for name in own)
+        for_images = any(PurePosixPath(name).suffix in READABLE for name in own)
         if len(own) == count and not for_images:
             of_frames[label] = tuple(masks.pop(name) for name in own)
-    of_images = {name[: -len(_SUFFIX)]: mask for name, mask in masks.items()}
-    found = Masks(path, None, of_frames, of_images, digest)
+    found = Masks(path, None, of_frames, masks, of_photos, digest)
     if all(found.of_video(label) is None for label in num_frames):
         folders = ", ".join(f"'{label}'" for label in num_frames)
         raise ImageError(

@@ -209,7 +209,7 @@ def test_unusable_masks_are_refused_in_one_line(
 def test_each_video_has_its_own_masks(tmp_path: Path) -> None:
     for name in ("a/1.png", "a/2.png", "b/x.jpg.png", "photos/y.png"):
         write(tmp_path / name, LEFT)
-    masks = read_masks(tmp_path, ["a", "b", "c"], [2, 2, 2])
+    masks = read_masks(tmp_path, ["a", "b", "c"], [2, 2, 2], ["photos/y.jpg", "photos/z.jpg"])
     a, b = masks.of_video("a"), masks.of_video("b")
     assert a is not None
     assert b is not None
@@ -222,6 +222,19 @@ def test_each_video_has_its_own_masks(tmp_path: Path) -> None:
         masks.of_photo("photos/y.jpg", (10, 10))
     with pytest.raises(ColmapAv1Error, match="no mask"):
         read_masks(tmp_path, ["d", "e"], [2, 2])
+
+
+@pytest.mark.parametrize("names", [("1.png", "2.png"), ("x.jpg.png", "y.jpg.png")])
+def test_masks_of_photos_are_not_masks_of_the_only_video(
+    names: tuple[str, ...], tmp_path: Path
+) -> None:
+    for name in (*names, "photos/z.PNG"):
+        write(tmp_path / name, LEFT)
+    masks = read_masks(tmp_path, [""], [2], ["photos/z.jpg"])
+    own = masks.of_video("")
+    assert own is not None
+    assert len(own.of_frames) + len(own.of_images or {}) == 2
+    assert masks.of_photo("photos/z.jpg", (WIDTH, HEIGHT)) is not None
 
 
 @given(
