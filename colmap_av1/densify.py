@@ -187,7 +187,7 @@ def densify(
                 of_tracks,
                 views,
                 image_set,
-                _pictures(image_set, inputs, photos_there, scratch, options),
+                _pictures(image_set, of_videos, photos_there, scratch, options),
                 options=options,
                 clock=clock,
                 progress=progress,
@@ -256,14 +256,18 @@ def _track(
 
 def _pictures(
     image_set: ImageSet,
-    inputs: Inputs,
+    of_videos: Sequence[VideoImages],
     photos: Sequence[Photo],
     scratch: Path,
     options: DensifyOptions,
 ) -> Pictures:
-    """A source of the images' pictures, which keeps those of videos in the scratch folder."""
-    kept = [KeptPictures(scratch / f"{number}.raw") for number in range(len(inputs.videos))]
-    shown = list(map(ShownVideo.as_played, inputs.videos, kept))
+    """A source of pictures in the size of the images; those of videos are kept in a folder."""
+    shown = [
+        replace(
+            ShownVideo.as_played(own.video, KeptPictures(scratch / f"{number}.raw")), size=own.size
+        )
+        for number, own in enumerate(of_videos)
+    ]
     return pictures_of(image_set, shown, [photo.path for photo in photos], options.match.reading)
 
 

@@ -100,6 +100,27 @@ def test_colours_and_observations_match_the_pictures(dense: Path) -> None:
     assert min(p.track.length() for p in model.points3D.values()) >= 1
 
 
+def test_images_may_be_smaller_than_the_video(truth: Truth, tmp_path: Path) -> None:
+    """Few tracks have 25 observations, so that most points are found in the pictures."""
+    half = pycolmap.Camera(truth.camera.todict())
+    half.rescale(0.5)
+    images = [
+        ModelImage(i + 1, f"{frame:04d}.png", 7, truth.cam_from_world[frame])
+        for i, frame in enumerate(FRAMES)
+    ]
+    (tmp_path / "true").mkdir()
+    write_model(tmp_path / "true", {7: half}, images, no_points())
+    long_tracks = replace(SPLATS, triangulate=TriangulateOptions(min_observations=25))
+    report = densify(tmp_path / "true", SCENE, tmp_path / "dense", options=long_tracks)
+    assert report.coverage > 0.99
+    xyz = point_cloud(pycolmap.Reconstruction(tmp_path / "dense"))
+    centres = camera_centres(truth.cam_from_world)
+    away = np.linalg.norm(xyz[:, None] - centres[None, ::10], axis=2).min(axis=1)
+    off = np.abs(render_scene.surface_distance(render_scene.build_scene(), xyz)) / away
+    assert np.median(off) < 0.005
+    assert np.quantile(off, 0.95) < 0.05
+
+
 def test_max_points_limits_the_cloud(true_model: Path, tmp_path: Path) -> None:
     bounded = replace(SPLATS, triangulate=TriangulateOptions(max_points=3000))
     report = densify(true_model, SCENE, tmp_path / "few", options=bounded)
