@@ -68,14 +68,26 @@ def grav(directions: NDArray[np.float64]) -> bytes:
     return gpmf_nest(b"STRM", gpmf(b"SCAL", "s", 32767), gpmf(b"GRAV", "s", rows))
 
 
-def with_gpmf(video: Path, output: Path, payloads: Sequence[tuple[float, bytes]]) -> Path:
-    """Copy an AV1 video and add a data track of payloads, each with its duration in seconds."""
+def with_gpmf(
+    video: Path,
+    output: Path,
+    payloads: Sequence[tuple[float, bytes]],
+    *,
+    is_first: bool = False,
+) -> Path:
+    """Copy an AV1 video and add a data track of payloads, each with its duration in seconds.
+
+    If `is_first`, the track precedes the video, so that the file begins with its first payload.
+    """
     milliseconds = Fraction(1, 1000)
     with av.open(str(video)) as source, av.open(str(output), "w") as target:
         stream = source.streams.video[0]
         size = {"width": stream.width, "height": stream.height}
+        if is_first:
+            track = target.add_mux_stream("bin_data", time_base=milliseconds)
         copied = target.add_mux_stream("av1", time_base=stream.time_base, **size)
-        track = target.add_mux_stream("bin_data", time_base=milliseconds)
+        if not is_first:
+            track = target.add_mux_stream("bin_data", time_base=milliseconds)
         track.codec_tag = "gpmd"
         track.metadata["handler_name"] = "GoPro MET"
         for packet in source.demux(stream):

@@ -247,14 +247,16 @@ def with_srt(clip: Path, folder: Path, text: str) -> Path:
     return video
 
 
-def test_path_of_a_gopro_is_read(clip: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_first", [False, True])
+def test_path_of_a_gopro_is_read(clip: Path, tmp_path: Path, is_first: bool) -> None:
     down = np.tile([0.0, 1.0, 0.0], (5, 1))
     payloads = [
         (0.4, gps5(PLACES[:4]) + grav(down)),
         (0.2, gps5(PLACES[:2], fix=0)),
         (0.4, gps9(PLACES[4:8], [3, 3, 0, 2])),
     ]
-    found = positions_of(with_gpmf(clip, tmp_path / "gopro.mp4", payloads))
+    path = with_gpmf(clip, tmp_path / "gopro.mp4", payloads, is_first=is_first)
+    found = positions_of(path)
     np.testing.assert_allclose(found.times, [0, 0.1, 0.2, 0.3, 0.6, 0.7, 0.9], atol=1e-9)
     np.testing.assert_allclose(found.places, PLACES[[0, 1, 2, 3, 4, 5, 7]], atol=2e-7)
     np.testing.assert_allclose(found.gravity_times, np.arange(5) * 0.08, atol=1e-9)

@@ -98,8 +98,8 @@ def read_positions(video: VideoFile) -> Positions | None:
     found: Positions | None = None
     start = 0.0
     if video.has_telemetry:
+        start = _first_picture(video)
         with open_container(video.path, apply_edits=True) as container:
-            start = _first_picture(video, container)
             packets = _packets(container)
             found = _of_data(container, packets, start)
             if found is None or found.left_out is not None:
@@ -155,26 +155,24 @@ def _of_srt_file(path: Path, place: tuple[float, float, float] | None) -> Positi
     return replace(found, source=str(path), stream=None) if found else None
 
 
-def _first_picture(video: VideoFile, container: Any) -> float:
+def _first_picture(video: VideoFile) -> float:
     """Time of a video's first picture on the clock of players, even if an edit list hides it.
 
     An edit list shifts the pictures to compensate the delay of coding out of order. Telemetry has
     another edit list, or none.
     """
-    stream = container.streams[video.index]
-    if "mov" not in video.container:
+    with open_container(video.path, apply_edits=True) as edited:
+        stream = edited.streams[video.index]
+        if "mov" not in video.container:
+            return _start(stream)
+        with until_damage(), open_container(video.path) as unedited:
+            shown = next((p for p in edited.demux(stream) if p.size and p.pts is not None), None)
+            same = unedited.streams[video.index]
+            for packet in unedited.demux(same):
+                if shown is not None and packet.pos == shown.pos and packet.pts is not None:
+                    later = (packet.pts - shown.pts) * stream.time_base
+                    return _start(same) - float(later)
         return _start(stream)
-    with (
-        until_damage(),
-        open_container(video.path) as unedited,
-    ):
-        shown = next((p for p in container.demux(stream) if p.size and p.pts is not None), None)
-        same = unedited.streams[video.index]
-        for packet in unedited.demux(same):
-            if shown is not None and packet.pos == shown.pos and packet.pts is not None:
-                later = (packet.pts - shown.pts) * stream.time_base
-                return _start(same) - float(later)
-    return _start(stream)
 
 
 def _start(stream: Any) -> float:
