@@ -554,12 +554,17 @@ def _match_jointly(
         context.progress,
         cameras=cameras,
     )
-    tracked = [own.tracked for own in images.videos]
     return match_jointly(
         run,
         [
-            VideoTracks(own.tracks, own.chosen, own.video.inter_share, own.video.read_out)
-            for own in tracked
+            VideoTracks(
+                own.tracked.tracks,
+                own.tracked.chosen,
+                own.tracked.video.inter_share,
+                fast,
+                own.tracked.video.read_out,
+            )
+            for own, fast in zip(images.videos, images.fast, strict=True)
         ],
         images.image_set,
         options.density,

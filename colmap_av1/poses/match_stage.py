@@ -13,7 +13,6 @@ from colmap_av1.database.writing import write_matched_images
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.depth import DepthEvidence
-from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.match_images import (
@@ -165,7 +164,7 @@ def _key_images(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) ->
     for video, own in enumerate(videos):
         frames = own.chosen.frames
         tracks = pose_tracks(run, own.tracks).keep_frames(frames)
-        found = key_images_of_video(run, tracks, own.chosen, own.inter_share)
+        found = key_images_of_video(run, tracks, own.chosen, own.inter_share, own.fast)
         index += (found + image_set.images_of(video).start).tolist()
     return index + list(range(image_set.images_of(len(videos)).start, len(image_set.sequence)))
 
@@ -189,10 +188,9 @@ def _selected_tracks(
     for video, own in enumerate(videos):
         with run.clock.measure("pairs"):
             tracks = pose_tracks(run, own.tracks)
-            fast = fast_frames(own.tracks)
             sparse = select_tracks(tracks.keep_frames(image_set.of_video(video).frames), density)
         path = run.shown[video].video.path
-        selected.append(SelectedTracks(path, sparse, own.inter_share, fast))
+        selected.append(SelectedTracks(path, sparse, own.inter_share, own.fast))
     return selected
 
 

@@ -53,6 +53,7 @@ class VideoTracks:
         tracks: its tracks.
         chosen: the frames that are images.
         inter_share: see `TrackedVideo`.
+        fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
         read_out: see `TracksResult`.
         digest: digest of the stage that stores them; empty if they are not stored.
     """
@@ -60,6 +61,7 @@ class VideoTracks:
     tracks: Tracks
     chosen: ChosenImages
     inter_share: NDArray[np.float32]
+    fast: NDArray[np.bool_]
     read_out: float | None
     digest: str = ""
 
@@ -118,6 +120,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
             options.camera,
             run.context,
         )
+        fast = fast_frames(tracks)
         # Later stages need no other frames of a long video.
         tracks = tracks.keep_frames(chosen.frames) if is_long else tracks
         _check_chosen(run, chosen, tracks.num_frames)
@@ -128,6 +131,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
                 names=np.array(chosen.names),  # np.savez keeps names as they are
                 frames=chosen.frames,
                 inter_share=tracked.inter_share,
+                fast=fast,
             )
         check_unchanged(*source.files)
         return TracksResult(tracks.num_frames, tracks.num_tracks, read_out, tracked.warnings)
@@ -224,19 +228,31 @@ def _spread_in(run: Run, tracked: TrackedVideo, candidates: NDArray[np.int32]) -
     candidates = candidates[candidates < tracks.num_frames]
     names = image_names(run.options.match.images.file_name, candidates.tolist())
     every = ChosenImages(names, candidates)
-    key = key_images_of_video(run, tracks, every, tracked.inter_share)
+    key = key_images_of_video(run, tracks, every, tracked.inter_share, fast_frames(tracks))
     most = min(run.options.max_images, len(candidates))
     return every.some(spread_images(tracks.subsample_frames(candidates), most, key))
 
 
 def key_images_of_video(
-    run: Run, tracks: Tracks, chosen: ChosenImages, inter_share: NDArray[np.float32]
+    run: Run,
+    tracks: Tracks,
+    chosen: ChosenImages,
+    inter_share: NDArray[np.float32],
+    fast: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
-    """Indices of the key images among some images of a video."""
+    """Indices of the key images among some images of a video.
+
+    Args:
+        run: the run.
+        tracks: tracks of the video.
+        chosen: the images.
+        inter_share: see `TrackedVideo`.
+        fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
+    """
     mapping, links = run.options.mapping, run.options.match.links
     always = images_to_link(inter_share, chosen.frames, links)
     if links.links != "none":
-        always |= fast_frames(tracks)[chosen.frames]
+        always |= fast[chosen.frames]
     return key_images(
         tracks,
         chosen.frames,
@@ -265,6 +281,7 @@ def read_tracks(run: Run, video: int, stage: Kept[TracksResult]) -> VideoTracks:
             tracks_of(file),
             ChosenImages([str(name) for name in file["names"]], file["frames"]),
             file["inter_share"],
+            file["fast"],
             stage.result.read_out,
             stage.digest,
         )
