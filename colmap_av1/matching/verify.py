@@ -353,7 +353,8 @@ def agreeing_matches(
     """
     a, b = xa.T.astype(np.float64), xb.T.astype(np.float64)
     agrees = np.zeros(a.shape[1], dtype=np.bool_)
-    if geometry.E is not None:
+    # An uncalibrated pair may have an essential matrix, too, which explains too few matches.
+    if geometry.E is not None and geometry.config != TwoViewConfig.UNCALIBRATED:
         focal = sum(camera.mean_focal_length() for camera in cameras) / 2
         rays = [
             np.asarray(camera.cam_from_img(x.T), dtype=np.float64).reshape(-1, 2).T
