@@ -6,7 +6,7 @@ A seam lies between two images that are neighbours in time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -155,9 +155,15 @@ class Seams:
         )
 
 
-def model_seams(reconstruction: pycolmap.Reconstruction) -> Seams:
-    """Count the points at each seam of a model, see `Seams`."""
+def model_seams(reconstruction: pycolmap.Reconstruction, photos: Collection[str] = ()) -> Seams:
+    """Count the points at each seam of a model, see `Seams`.
+
+    Args:
+        reconstruction: the model.
+        photos: names of photos, which have no neighbours in time.
+    """
     images, seams = images_in_time(reconstruction)
+    seams = [k for k in seams if images[k].name not in photos and images[k + 1].name not in photos]
     views, point, xyz = _seen_points(reconstruction, images)
     num_images, num_seams = len(images), max(len(images) - 1, 0)
     order = np.lexsort((views, point))

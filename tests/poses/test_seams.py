@@ -79,6 +79,15 @@ def test_seams_are_found_with_a_camera_per_image(tmp_path: Path) -> None:
     assert model_seams(read_model(tmp_path)).weak == [14]
 
 
+def test_photos_are_no_neighbours_in_time(tmp_path: Path) -> None:
+    views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
+    write_row(tmp_path, views, 0)
+    model = read_model(tmp_path)
+    names = sorted(image.name for image in model.images.values())
+    assert model_seams(model, names[15:]).weak == []
+    assert len(model_seams(model, names[15:]).num_points) == 14
+
+
 def write_row(folder: Path, views: list[list[int]], again: int, *, num_cameras: int = 1) -> None:
     """Write a model of thirty images in a row.
 
