@@ -179,7 +179,12 @@ def pose_stage(
                     database = partial / "few_tracks.db"
                     shutil.copyfile(copy, database)
                     keep_start_tracks(database)
-                found = map_with(attempt, database)
+                try:
+                    found = map_with(attempt, database)
+                except ModelError:
+                    if attempt is attempts[-1]:
+                        raise
+                    continue
                 if found:
                     break
         if not found:

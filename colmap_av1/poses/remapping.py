@@ -19,6 +19,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
+from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.posed_model import (
     PosedModel,
@@ -157,6 +158,9 @@ def _map_tracks(
 ) -> PosedModel | None:
     """Map the images of a model from its tracks with COLMAP's global mapper; None if it fails."""
     options = run.options
+    # Models do not store that focal lengths are known, so pairs are verified with fundamental
+    # matrices. With essential matrices, most rendered walks came out slightly more accurate, but
+    # the walk `cafe` bent, with each of four seeds: 10 % of its extent instead of 0.9 %.
     cameras = [known.cameras[image.camera_id] for image in known.images]
     frames = posed_images_of(known, image_set).frames
     min_matches = options.match.pairs.min_matches
@@ -166,21 +170,24 @@ def _map_tracks(
         database, models = Path(folder) / "database.db", Path(folder) / "models"
         write_matched_images(database, [i.name for i in known.images], cameras, matched)
         keep_start_tracks(database)
-        sizes = map_poses(
-            database,
-            models,
-            MapOptions(
-                mapper="global",
-                refine_intrinsics=refines_intrinsics(options),
-                seed=options.match.run.seed,
-                num_threads=options.mapping.mapper_threads,
-            ),
-            image_path=None,
-            log=run.stages / "mapper.log",
-            num_images=len(known.images),
-            progress=run.progress,
-            ends_early=True,
-        )
+        try:
+            sizes = map_poses(
+                database,
+                models,
+                MapOptions(
+                    mapper="global",
+                    refine_intrinsics=refines_intrinsics(options),
+                    seed=options.match.run.seed,
+                    num_threads=options.mapping.mapper_threads,
+                ),
+                image_path=None,
+                log=run.stages / "mapper.log",
+                num_images=len(known.images),
+                progress=run.progress,
+                ends_early=True,
+            )
+        except ModelError:  # the first mapping is there
+            return None
         return _with_camera_ids(posed_model(read_model(models / "0")), known) if sizes else None
 
 
