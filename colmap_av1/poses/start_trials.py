@@ -127,5 +127,7 @@ def _without_failing_starts(
             demoted(geometry) if demote else geometry
             for geometry, demote in zip(found.geometries, is_in.tolist(), strict=True)
         ]
+        if all(new is old for new, old in zip(geometries, found.geometries, strict=True)):
+            break  # the next trial would be the same
         found = replace(found, geometries=geometries)
     return matched
