@@ -145,7 +145,9 @@ def focal_length_errors(model: PosedModel) -> dict[int, float]:
         determined.
     """
     num_images = len(model.images)
-    some = np.array(evenly_spread(num_images, min(num_images, _COVARIANCE_IMAGES)))
+    spread = evenly_spread(num_images, _COVARIANCE_IMAGES)
+    _, first = np.unique([image.camera_id for image in model.images], return_index=True)
+    some = np.union1d(spread, first)  # each camera has an image
     place = np.full(num_images, -1)
     place[some] = np.arange(len(some))
     points, _ = keep_observations(model.points, place[model.points.image] >= 0)
