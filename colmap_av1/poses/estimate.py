@@ -351,8 +351,15 @@ def _pose_images(
 
 def _long_range_check(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongRangeResult]:
     """The long-range check of the poses."""
-    linked = posed.matches.result.links.looked_again
-    return long_range_stage(run, posed.tracks, image_set, posed.moving, posed.last, linked=linked)
+    return long_range_stage(
+        run,
+        posed.tracks,
+        image_set,
+        posed.moving,
+        posed.last,
+        masked=posed.dynamic.digest if posed.dynamic is not None else None,
+        linked=posed.matches.result.links.looked_again,
+    )
 
 
 def trusted_tracks(

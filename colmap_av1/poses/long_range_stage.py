@@ -54,6 +54,7 @@ def long_range_stage(
     moving: Mapping[str, Mask],
     posed: Kept[PosesResult],
     *,
+    masked: str | None,
     linked: bool,
 ) -> Kept[LongRangeResult]:
     """Match a few pairs of images far apart in time, and compare the matches with the poses.
@@ -64,6 +65,7 @@ def long_range_stage(
         image_set: the images.
         moving: masks that exclude dynamic pixels, by image name.
         posed: the stage that estimated the poses.
+        masked: digest of the stage that made the masks; None without one.
         linked: whether loop closures have been searched.
     """
 
@@ -80,7 +82,7 @@ def long_range_stage(
     return run_stage(
         run.stages,
         "far_views",
-        [posed.digest, linked],
+        [posed.digest, masked, linked],
         LongRangeResult,
         into=run.stages,
         products=[],
