@@ -101,7 +101,8 @@ def map_database(
 
     Raises:
         DatabaseError: the database is missing, unreadable, or has no matches that a mapper can use.
-        ImageError: an image of the database is missing from the folder or differs in size.
+        ImageError: an image of the database is missing from the folder, or the first one differs in
+            size.
         ModelError: the mapper fails or finds no model; the message names its log.
         OptionError: the output is not empty and must not be replaced, or the known distance does
             not fit the model.

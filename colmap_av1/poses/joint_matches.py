@@ -91,7 +91,7 @@ class JointEstimate:
 
     Attributes:
         num_registered: number of registered images of each model, the largest first. The other
-            figures describe the first model.
+            figures describe the one that was estimated first, mostly the largest.
         far_views: median long-range epipolar error in pixels, over pairs of images ten or more
             apart; None if no such images have enough matches.
         far_views_largest: its 90th percentile.
@@ -152,6 +152,7 @@ def match_jointly(
     )
     for own in further:
         models.append(_model_of(own.run, own.posed, own.image_set))
+    first = models[0]
     models.sort(key=lambda model: -len(model.placed.images))
     registered = {image.name for model in models for image in model.placed.images}
     left = [name for name in image_set.images.names if name not in registered]
@@ -169,8 +170,11 @@ def match_jointly(
         paired = _paired(run, image_set, agreeing, others, density)
     cameras = _cameras(run, image_set, models)
     matched = verify_images(paired, cameras, run.options.match.verify, run.context)
+    warnings = _warnings(far, models, left, model_of, image_set)
+    if first.adjusted.seams_warning is not None:
+        warnings.append(first.adjusted.seams_warning)
     matches = posed.matches.result
-    focal = [camera.mean_focal_length() for camera in models[0].placed.camera_of_image]
+    focal = [camera.mean_focal_length() for camera in first.placed.camera_of_image]
     return JointMatches(
         cameras=cameras,
         focal_length=_focal_length(run, cameras[0]),
@@ -179,7 +183,7 @@ def match_jointly(
         link_tracks=posed.links,
         track_lengths=paired.track_lengths,
         depth=matches.depth,
-        warnings=(*matches.link_warnings, *_warnings(far, models, left, model_of, image_set)),
+        warnings=(*matches.link_warnings, *warnings),
         estimate=JointEstimate(
             num_registered=tuple(len(model.placed.images) for model in models),
             far_views=far.far_views if far is not None else None,
@@ -537,6 +541,4 @@ def _warnings(
             f"have no matches: {some_names(alone)}; --verify pairs matches them by motion alone, "
             "which may bend models"
         )
-    if models[0].adjusted.seams_warning is not None:
-        warnings.append(models[0].adjusted.seams_warning)
     return warnings

@@ -74,7 +74,8 @@ def models_of_images(
     mapper would make bent models of these images, or join models at a wrong place. Therefore, only
     a few consecutive images belong to the model around them, or next to them at an end of the
     video. Images of videos without registered images, and photos, belong to the model that they
-    share the most tracks with.
+    share the most tracks with, or to the first if they share none: a mapper makes a separate model
+    of them.
 
     Args:
         tracks: tracks with observations in images that are not registered.
