@@ -156,7 +156,8 @@ def whole_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
         elif any(path.iterdir()) and not overwrite:
             raise OSError(errno.ENOTEMPTY, os.strerror(errno.ENOTEMPTY), str(path))
         else:  # the folder itself stays, because it may be the user's current folder
-            _exchange(path, partial)
+            with held_back():
+                _exchange(path, partial)
 
 
 @contextmanager
@@ -211,7 +212,7 @@ def _exchange(path: Path, partial: Path) -> None:
         _move_entries(path, before)
         before.rename(old)
         _move_entries(partial, path)
-    except OSError:
+    except BaseException:  # an interrupt may reach another thread first
         if old.exists():
             _move_entries(path, partial)
             old.rename(before)

@@ -5,6 +5,7 @@ import re
 import sys
 import threading
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,37 @@ def test_existing_folder_is_filled(tmp_path: Path) -> None:
     with pytest.raises(KeyError), whole_folder(output, overwrite=True) as partial:
         {}[(partial / "points3").write_text("3")]
     assert (output / "points2").read_text() == "2"
+
+
+@pytest.mark.parametrize("number", range(7))
+def test_interrupted_exchange_keeps_the_old_content(
+    tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The interrupt comes before one of seven moves: of three old and of four new files."""
+    output = tmp_path / "model"
+    output.mkdir()
+    for name in ("0", "1", "2"):
+        (output / name).write_text("old")
+    calls = count()
+    move = Path.replace
+
+    def interrupted(entry: Path, target: Path) -> Path:
+        if next(calls) == number:
+            raise KeyboardInterrupt
+        return move(entry, target)
+
+    def replace_content() -> None:
+        with whole_folder(output, overwrite=True) as partial:
+            for name in ("0", "1", "2", "3"):
+                (partial / name).write_text("new")
+            monkeypatch.setattr(Path, "replace", interrupted)
+
+    with pytest.raises(KeyboardInterrupt):
+        replace_content()
+    monkeypatch.undo()
+    remove_leftovers(tmp_path)
+    assert {path.name: path.read_text() for path in output.iterdir()} == dict.fromkeys("012", "old")
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]
 
 
 @pytest.mark.parametrize("is_there", [False, True])
