@@ -255,8 +255,6 @@ def track_video(
             num_pixels = num_frames * tracks.width * tracks.height
             if source.stream is not source.pictures:
                 tracks = tracks.scale_to(source.pictures.picture_size)
-        # Motion was read while it was chained, so that time is subtracted.
-        clock.seconds["tracks"] -= clock.seconds["motion"]
         if options.refine.refine != "none":
             with clock.measure("refinement"):
                 pictures = clock.iterate(
@@ -269,7 +267,6 @@ def track_video(
                     options.refine,
                     lambda done: progress("refinement", done, tracks.num_frames),
                 )
-            clock.seconds["refinement"] -= clock.seconds["decoding"]
     notes = [str(w.message) for w in caught]
     # The size of the whole file is an upper bound of the rate, so a low rate is truly low.
     bits_per_pixel = 8 * source.stream.path.stat().st_size / num_pixels

@@ -26,7 +26,9 @@ def progress_in(progress: Progress, stage: str, total: int) -> Callable[[int], N
 
 
 class Clock:
-    """Time of named stages, in the order in which they first ran.
+    """Time of named stages.
+
+    The time of a stage that is measured inside another one is not part of the time of the latter.
 
     Attributes:
         seconds: wall time of each stage so far.
@@ -36,17 +38,22 @@ class Clock:
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self.cpu_seconds: dict[str, float] = {}
+        # Wall and CPU time measured so far, of all stages.
+        self._measured = (0.0, 0.0)
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
-        """Add the time the body takes to a stage."""
+        """Add the time the body takes to a stage. Only one thread may measure."""
         start, cpu_start = time.perf_counter(), cpu_seconds()
+        before, cpu_before = self._measured
         try:
             yield
         finally:
             elapsed, cpu = time.perf_counter() - start, cpu_seconds() - cpu_start
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
-            self.cpu_seconds[stage] = self.cpu_seconds.get(stage, 0.0) + cpu
+            inside, cpu_inside = self._measured[0] - before, self._measured[1] - cpu_before
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed - inside
+            self.cpu_seconds[stage] = self.cpu_seconds.get(stage, 0.0) + cpu - cpu_inside
+            self._measured = (before + elapsed, cpu_before + cpu)
 
     def iterate(self, stage: str, items: Iterable[_Item]) -> Iterator[_Item]:
         """Yield from `items`, and add the time to produce them to a stage."""

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -166,16 +167,17 @@ def test_time_of_a_stage_is_counted_once(clip: Path) -> None:
     clock = Clock()
     lk = replace(OPTIONS, refine=RefineOptions(refine="lk"))
     calls: list[tuple[str, int, int | None]] = []
-    with clock.measure("all"):
+    start = time.perf_counter()
+    for _ in range(2):  # as with two videos
         track_video(
             opened(clip),
             lk.tracking,
             one_size=True,
             context=RunContext(clock, lambda *w: calls.append(w)),
         )
-    whole = clock.seconds.pop("all")
-    assert min(clock.seconds.values()) >= 0
-    assert sum(clock.seconds.values()) <= whole
+    assert set(clock.seconds) == {"motion", "tracks", "decoding", "refinement"}
+    assert min(clock.seconds.values()) > 0
+    assert sum(clock.seconds.values()) <= time.perf_counter() - start
     assert ("motion", 16, 16) in calls
     assert calls[-1] == ("refinement", 16, 16)
 
