@@ -380,7 +380,7 @@ def _view_page(namespace: argparse.Namespace) -> None:
 
     model, report = Path(namespace.model), None
     check_page(namespace.output, [model], overwrite=namespace.overwrite)
-    folder = model.resolve().parents[1]
+    folder = model.resolve().parent.parent
     if model.resolve() == folder / "sparse" / "0" and (folder / "report.json").exists():
         try:
             report = read_report(folder)
@@ -407,6 +407,8 @@ def _serve(namespace: argparse.Namespace) -> None:
     try:
         print_text(f"http://127.0.0.1:{namespace.port} (end with Ctrl-C)\n")
         threading.Event().wait()
+    except KeyboardInterrupt:
+        pass
     finally:
         server.stop()
 

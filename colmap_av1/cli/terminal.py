@@ -71,7 +71,7 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
                 tasks[stage] = progress.add_task(stage, total=total, rate="")
             speed = progress.tasks[tasks[stage]].speed
             rate = f"{speed:.1f}/s" if speed else ""
-            progress.update(tasks[stage], completed=done, rate=rate)
+            progress.update(tasks[stage], completed=done, total=total, rate=rate)
 
         yield report
 

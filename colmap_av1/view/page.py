@@ -434,7 +434,7 @@ def _commands(model: Path, report: ReconstructReport | None) -> list[tuple[str, 
     if report is None:
         command = ["colmap-av1", "densify", "--model", str(model), "--video", "VIDEO"]
         return [("Add dense points from the video", shlex.join([*command, "--output", "OUTPUT"]))]
-    folder = shlex.quote(str(model.parent.parent))
+    folder = shlex.quote(str(model.resolve().parent.parent))
     return [
         ("Train with Brush", f"brush {folder} --with-viewer"),
         (

@@ -218,9 +218,8 @@ def _draw_tracks(picture: Image, drawing: _Drawing, frame: int) -> Image:
     shade = np.minimum(drawing.age[seen] * 255 // _OLD_AGE, 255).astype(np.uint8)
     table = np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], cv2.COLORMAP_TURBO))
     steps = np.minimum(drawing.age[seen], tail)
-    points = fixed_point(drawing.tracks.xy)
     for last, count, colour in zip(seen, steps, table[0, shade].tolist(), strict=True):
-        line = points[last - count : last + 1]
+        line = fixed_point(drawing.tracks.xy[last - count : last + 1])
         cv2.polylines(drawn, [line], False, colour, 1, cv2.LINE_AA, SHIFT)
         cv2.circle(drawn, line[-1].tolist(), 1 << SHIFT, colour, -1, cv2.LINE_AA, SHIFT)
     return np.asarray(drawn)
