@@ -26,7 +26,7 @@ class ReadOptions(Options):
 
     operating_point: int = option(
         0,
-        "operating point of a scalable stream (AV1 specification, 7.20: choose_operating_point)",
+        "operating point of a scalable stream (AV1 specification, 6.4.1: choose_operating_point)",
         least=0,
         most=_NUM_OPERATING_POINTS - 1,
     )

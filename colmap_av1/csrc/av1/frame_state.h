@@ -126,7 +126,7 @@ struct TileBounds {
   int mi_col_start = 0;
   int mi_col_end = 0;
 
-  // is_inside( ) of 5.11.5
+  // is_inside( ) of 5.11.51
   bool contains(int row, int col) const {
     return col >= mi_col_start && col < mi_col_end && row >= mi_row_start && row < mi_row_end;
   }
@@ -146,7 +146,7 @@ struct FrameContext {
   std::size_t blocks_capacity = 0;
   std::vector<MotionFieldEntry> motion_field;      // [mi_rows / 2][mi_cols / 2]
   const std::uint8_t* prev_segment_ids = nullptr;  // null: all 0
-  std::array<bool, TOTAL_REFS_PER_FRAME> ref_present{};
+  std::array<bool, TOTAL_REFS_PER_FRAME> ref_usable{};
   std::array<bool, TOTAL_REFS_PER_FRAME> ref_scaled{};   // is_scaled( )
   std::array<int, TOTAL_REFS_PER_FRAME> ref_distance{};  // this frame's OrderHint less theirs
 

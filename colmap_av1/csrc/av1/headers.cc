@@ -249,14 +249,8 @@ void FrameHeaderReader::uncompressed_header() {
   }
   h.disable_frame_end_update_cdf =
       seq_.reduced_still_picture_header || h.disable_cdf_update ? true : r.flag();
-  if (h.primary_ref_frame == PRIMARY_REF_NONE) {
-    h.loop_filter_ref_deltas = {1, 0, 0, 0, -1, 0, -1, -1};
-    h.loop_filter_mode_deltas = {0, 0};
-  } else {
-    const FrameHeader& previous = reference(h.primary_ref_frame);
-    h.segmentation = previous.segmentation;
-    h.loop_filter_ref_deltas = previous.loop_filter_ref_deltas;
-    h.loop_filter_mode_deltas = previous.loop_filter_mode_deltas;
+  if (h.primary_ref_frame != PRIMARY_REF_NONE) {
+    h.segmentation = reference(h.primary_ref_frame).segmentation;
   }
   tile_info();
   quantization_params();
@@ -408,7 +402,7 @@ void FrameHeaderReader::compute_image_size() {
   }
 }
 
-// Requirements on references: semantics of ref_frame_idx (6.8.2) and of scaling (7.11.3.3)
+// Requirements on references: semantics of ref_frame_idx (6.8.2)
 void FrameHeaderReader::check_references() {
   for (int i = 0; i < REFS_PER_FRAME; ++i) {
     const ReferenceInfo& info = refs_[h.ref_frame_idx[i]];
@@ -563,11 +557,7 @@ void FrameHeaderReader::delta_lf_params() {
 
 // 5.9.11 Loop filter params syntax
 void FrameHeaderReader::loop_filter_params() {
-  if (h.coded_lossless || h.allow_intrabc) {
-    h.loop_filter_ref_deltas = {1, 0, 0, 0, -1, 0, -1, -1};
-    h.loop_filter_mode_deltas = {0, 0};
-    return;
-  }
+  if (h.coded_lossless || h.allow_intrabc) return;
   h.loop_filter_level[0] = r.literal(6);
   h.loop_filter_level[1] = r.literal(6);
   if (seq_.num_planes > 1 && (h.loop_filter_level[0] || h.loop_filter_level[1])) {
@@ -576,11 +566,8 @@ void FrameHeaderReader::loop_filter_params() {
   }
   r.literal(3);                // loop_filter_sharpness
   if (r.flag() && r.flag()) {  // loop_filter_delta_enabled, loop_filter_delta_update
-    for (auto& delta : h.loop_filter_ref_deltas) {
-      if (r.flag()) delta = static_cast<std::int8_t>(r.su(7));
-    }
-    for (auto& delta : h.loop_filter_mode_deltas) {
-      if (r.flag()) delta = static_cast<std::int8_t>(r.su(7));
+    for (int i = 0; i < TOTAL_REFS_PER_FRAME + 2; ++i) {
+      if (r.flag()) r.su(7);  // loop_filter_ref_deltas, then loop_filter_mode_deltas
     }
   }
 }

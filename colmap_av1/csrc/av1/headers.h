@@ -147,8 +147,6 @@ struct FrameHeader {
   bool all_lossless = false;
   std::array<bool, MAX_SEGMENTS> lossless_array{};
   std::array<int, 4> loop_filter_level{};
-  std::array<std::int8_t, TOTAL_REFS_PER_FRAME> loop_filter_ref_deltas{};
-  std::array<std::int8_t, 2> loop_filter_mode_deltas{};
   int cdef_bits = 0;
   std::array<int, 3> frame_restoration_type{};
   std::array<int, 3> loop_restoration_size{};

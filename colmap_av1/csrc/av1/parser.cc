@@ -147,7 +147,7 @@ void Parser::sequence_header_obu(Bytes data) {
   seq_ = std::make_shared<const SequenceHeader>(read_sequence_header(reader));
   const int op = options_.operating_point <= seq_->operating_points_cnt_minus_1
                      ? options_.operating_point
-                     : 0;  // 7.20 note: an operating point that is missing means the first
+                     : 0;  // streams that lack the requested operating point have at least one
   operating_point_idc_ = seq_->operating_point_idc[op];
 }
 
@@ -218,7 +218,7 @@ void Parser::start_frame() {
   context_.seq = seq_.get();
   context_.header = &header_;
   context_.prev_segment_ids = nullptr;
-  context_.ref_present.fill(false);
+  context_.ref_usable.fill(false);
   context_.ref_scaled.fill(false);
   context_.ref_distance.fill(0);
   for (int ref = LAST_FRAME; ref <= ALTREF_FRAME; ++ref) {
@@ -231,7 +231,7 @@ void Parser::start_frame() {
                         header_.frame_height;
     constexpr int kNoScale = 1 << REF_SCALE_SHIFT;
     context_.ref_scaled[ref] = x_scale != kNoScale || y_scale != kNoScale;
-    context_.ref_present[ref] = 2 * header_.frame_width >= reference.upscaled_width &&
+    context_.ref_usable[ref] = 2 * header_.frame_width >= reference.upscaled_width &&
                                 2 * header_.frame_height >= reference.frame_height &&
                                 header_.frame_width <= 16 * reference.upscaled_width &&
                                 header_.frame_height <= 16 * reference.frame_height;

@@ -1,5 +1,5 @@
 // Tile, partition and block syntax with the filter parameters that are interleaved with it
-// (specification sections 5.11.2 to 5.11.5, 5.11.35 to 5.11.39, 5.11.56 to 5.11.58).
+// (specification sections 5.11.2 to 5.11.5, 5.11.12, 5.11.13, 5.11.55 to 5.11.58).
 #include <algorithm>
 
 #include "av1/error.h"
@@ -220,7 +220,7 @@ void TileParser::read_cdef() {
   }
 }
 
-// 5.11.35 Quantizer index delta syntax
+// 5.11.12 Quantizer index delta syntax
 void TileParser::read_delta_qindex() {
   const int sb_size = seq_->use_128x128_superblock ? BLOCK_128X128 : BLOCK_64X64;
   if ((b_->mi_size == sb_size && b_->skip) || !read_deltas_) return;
@@ -235,7 +235,7 @@ void TileParser::read_delta_qindex() {
   }
 }
 
-// 5.11.36 Loop filter delta syntax
+// 5.11.13 Loop filter delta syntax
 void TileParser::read_delta_lf() {
   const int sb_size = seq_->use_128x128_superblock ? BLOCK_128X128 : BLOCK_64X64;
   if ((b_->mi_size == sb_size && b_->skip) || !read_deltas_ || !header_->delta_lf_present) return;

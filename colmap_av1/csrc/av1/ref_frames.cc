@@ -66,8 +66,8 @@ int TileParser::comp_ref_type_context() const {
 void TileParser::read_ref_frames() {
   const auto set = [&](int ref0, int ref1) {
     b_->ref_frame = {static_cast<std::int8_t>(ref0), static_cast<std::int8_t>(ref1)};
-    if (!frame_->ref_present[ref0] || (ref1 > INTRA_FRAME && !frame_->ref_present[ref1])) {
-      throw BitstreamError("block refers to a frame that is missing");
+    if (!frame_->ref_usable[ref0] || (ref1 > INTRA_FRAME && !frame_->ref_usable[ref1])) {
+      throw BitstreamError("block refers to a frame that is missing or has an unsuitable size");
     }
   };
   if (b_->skip_mode) return set(header_->skip_mode_frame[0], header_->skip_mode_frame[1]);

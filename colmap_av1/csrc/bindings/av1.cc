@@ -5,6 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <stdexcept>
 #include <utility>
 #include <vector>
 
@@ -154,6 +155,7 @@ nb::dict sequence_dict(const SequenceHeader& s, int operating_point_idc) {
 // The blocks of a decoded frame as bytes, the index of each unit's block, and the local warps. The
 // first two are moved out of the event, so this can be called once.
 nb::tuple take_blocks(Event& event) {
+  if (event.block_index.empty()) throw std::logic_error("the event has no blocks");
   const auto rows = static_cast<std::size_t>(event.header.mi_rows);
   const auto cols = static_cast<std::size_t>(event.header.mi_cols);
   std::vector<std::int32_t> params;

@@ -17,8 +17,8 @@ using namespace nb::literals;
 namespace colmap_av1 {
 namespace {
 
-constexpr std::size_t kMaxUnits = std::size_t{1} << 29;
-constexpr std::size_t kMaxUnitsAlong = 65536;
+// AV1 frames have at most 65536 pixels in each direction, units have 4.
+constexpr std::size_t kMaxUnitsAlong = 65536 / 4;
 
 int read_int(nb::handle value, const char* name) {
   int number = 0;
@@ -184,7 +184,7 @@ void HeldFrameMotion::hold_blocks(nb::handle frame) {
                                                     "int32 [mi_rows, mi_cols]");
   const std::size_t rows = block_index_.shape(0);
   const std::size_t cols = block_index_.shape(1);
-  if (rows > kMaxUnitsAlong || cols > kMaxUnitsAlong || rows * cols > kMaxUnits) {
+  if (rows > kMaxUnitsAlong || cols > kMaxUnitsAlong) {
     throw std::invalid_argument("block_index holds more units than an AV1 frame can have");
   }
   motion_.mi_rows = static_cast<int>(rows);
