@@ -226,7 +226,6 @@ def reconstruct(
             masks.check([own.picture_size], names, options.match.images)
     context = RunContext.of(options.match.run, clock, progress)
     with open_stages(output, "reconstruct") as stages, ExitStack() as opened:
-        _remove_earlier_layout(stages)
         sources = tuple(
             opened.enter_context(
                 open_source(
@@ -256,17 +255,6 @@ def reconstruct(
             report = replace(report, gaussians=Path(gaussians), seconds=clock.seconds)
         _write_report(report)
     return report
-
-
-def _remove_earlier_layout(stages: Path) -> None:
-    """Remove the models that earlier versions kept in folders of the stages.
-
-    Trainers that search the whole output folder would find them.
-    """
-    for folder in (stages, *stages.parent.glob(f"model_*/{stages.name}")):
-        for name in ("poses", "placed", "adjusted", "in_place"):
-            for file in (folder / name).rglob("*.bin"):
-                file.unlink()
 
 
 def _as_converted(options: ReconstructOptions) -> MatchOptions:

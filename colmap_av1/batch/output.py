@@ -218,7 +218,7 @@ def _files_of_ours(output: Output, name: str, there: set[str], new: set[str]) ->
         with suppress(ValueError, RecursionError):
             listed = json.loads(unfinished)
     elif report is not None:
-        listed = report.get("files", sorted(new))  # Reports of earlier versions have no list.
+        listed = report.get("files")
     if not isinstance(listed, list):
         raise OptionError(
             f"{name}: exists and was not created by a batch: give another output, or move it away"

@@ -71,7 +71,14 @@ def frames_by_content(
             )
         if _is_clearly_less(likeness[k, found[k]], likeness[k, best]):
             twins = [files[int(i)].name for i in np.flatnonzero(likeness.argmax(axis=1) == best)]
-            raise ImageError(f"{' and '.join(twins)} show the same frame, {best}: keep one of them")
+            if len(twins) > 1:
+                raise ImageError(
+                    f"{' and '.join(twins)} show the same frame, {best}: keep one of them"
+                )
+            raise ImageError(
+                f"{path}: shows frame {best}, but the names of the images are not in the order of "
+                "their frames: rename them, or list their frames in a --frame_list"
+            )
         _check_rivals(path, int(found[k]), likeness[k], frames)
     return np.asarray(found, dtype=np.int32)
 

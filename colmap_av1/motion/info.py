@@ -233,7 +233,7 @@ class Structure:
             )
         if self.num_shown < _MIN_KEY_FRAME_DISTANCE * (self.num_key_frames - 1):
             reasons.append(
-                f"a key frame every {self.num_coded / self.num_key_frames:.1f} frames cuts "
+                f"a key frame every {self.num_shown / self.num_key_frames:.1f} frames cuts "
                 "every track: encode it with -g 9999"
             )
         if bits_per_pixel < _MIN_BITS_PER_PIXEL:
@@ -250,6 +250,7 @@ class _Counts:
     num_hidden: int = 0
     references: Counter[int] = field(default_factory=Counter)
     hidden_references: int = 0
+    # The median length of the displacements of each shown frame, in pixels per shown frame.
     motion: list[float] = field(default_factory=list)
     # The display index of the first shown frame of each size (width, height).
     first_of_size: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -272,6 +273,7 @@ def _count_references(frame: FrameMotion, counts: _Counts) -> None:
     if frame.display_index < 0:
         return
     inter = frame.use_intrabc == 0
+    speeds = []
     for list_index in (0, 1):
         reference = frame.ref_frame[..., list_index]
         used = (reference > 0) & inter
@@ -289,8 +291,9 @@ def _count_references(frame: FrameMotion, counts: _Counts) -> None:
         length = np.hypot(displacement[:, 0], displacement[:, 1])
         valid = (frame.ref_display_index[reference[used]] >= 0) & (distance > 0)
         valid &= np.isfinite(length)
-        if valid.any():
-            counts.motion.append(float(np.median(length[valid] / distance[valid])))
+        speeds.append(length[valid] / distance[valid])
+    if speeds and len(speed := np.concatenate(speeds)):
+        counts.motion.append(float(np.median(speed)))
 
 
 def _num_bytes(video: Video) -> int:

@@ -104,7 +104,16 @@ def choose_footage(
             "warnings": prepared.tracked.video.warnings,
         }
 
-    given = (options.images, options.camera, options.read, options.encode, options.tracks)
+    given = (
+        options.images,
+        options.camera,
+        options.read,
+        options.encode,
+        options.reencode,
+        options.tracks,
+        options.refine,
+        options.verify,
+    )
     depends_on = [
         file_digest(video.path),
         given,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -23,6 +22,7 @@ from colmap_av1.evaluate.metrics.renderings import RenderingMetrics, rendering_m
 from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.training.splatting import Milestone, split_images, write_scene
 from colmap_av1.geometry.colmap_model import model_points, posed_images, read_model, write_model
+from colmap_av1.images.names import natural_key
 from colmap_av1.options.compare import GSPLAT, words_of_trainer
 from colmap_av1.splats.gaussians import write_model_gaussians
 from colmap_av1.util.digests import file_digest
@@ -245,7 +245,7 @@ def match_renders(folder: Path, references: Sequence[Path]) -> list[Path]:
     if all(reference.stem in by_stem for reference in references):
         return [by_stem[reference.stem] for reference in references]
     if len(found) == len(references):
-        return sorted(found, key=_natural)
+        return sorted(found, key=lambda path: natural_key(path.name))
     raise EvaluationError(
         f"{folder}: has {len(found)} renderings for {len(references)} test images: let the "
         "trainer's command write one for each into {renders}"
@@ -293,10 +293,6 @@ def _positive(word: str) -> float:
     if not 0 < value < math.inf:
         raise ValueError(word)
     return value
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    return [(int(w), "") if w.isdigit() else (-1, w) for w in re.split(r"(\d+)", path.name)]
 
 
 def _plain(state: Milestone) -> dict[str, Any]:
