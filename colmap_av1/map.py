@@ -53,7 +53,7 @@ class MapReport:
         place: coordinates of the model in folder 0: units, axes, origin and their source, as in
             `place.json`.
         figures: figures of the model in folder 0.
-        far_views: result of the long-range check of this model; None if its images cannot be read.
+        long_range: result of the long-range check of this model; None if its images cannot be read.
         seconds: wall time of each stage.
         warnings: warnings for the user.
     """
@@ -65,7 +65,7 @@ class MapReport:
     num_registered: tuple[int, ...]
     place: Place
     figures: ModelFigures
-    far_views: LongRangeErrors | None
+    long_range: LongRangeErrors | None
     seconds: dict[str, float]
     warnings: tuple[str, ...]
 
@@ -151,7 +151,7 @@ def map_database(
         raise ModelError(cannot_write(output, error)) from error
     model = read_model(output / "0")
     unreadable = None
-    with clock.measure("far views"):
+    with clock.measure("long range"):
         try:
             found = check_model(model, image_path=image_path, database=database, progress=progress)
         except ImageError as error:  # The model itself is valid without the check.
@@ -164,7 +164,7 @@ def map_database(
         focal_length_warning(model.cameras.values()),
         # Seams of the model are more specific than gaps of the matches.
         *(found.seam_warnings or (few_matches_warning(checked.thin_gaps),)),
-        found.far_views.warning() if found.far_views else unreadable,
+        found.long_range.warning() if found.long_range else unreadable,
     )
     return MapReport(
         output=output,
@@ -174,7 +174,7 @@ def map_database(
         num_registered=num_registered,
         place=placement.place,
         figures=found.figures,
-        far_views=found.far_views,
+        long_range=found.long_range,
         seconds=clock.seconds,
         warnings=tuple(warning for warning in warnings if warning is not None),
     )

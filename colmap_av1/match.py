@@ -272,12 +272,12 @@ def match(
         )
         cameras = _listed_cameras(database, listed, images) if listed else None
         found = _match_images(images, cameras, scratch, options, context)
-        # The poses of pairs are wrong if a focal length is a guess.
+        # The poses of pairs are wrong if a focal length is assumed.
         has_focal_lengths = all(camera.has_prior_focal_length for camera in found.cameras)
         known = found.poses if isinstance(found, JointMatches) and has_focal_lengths else ()
         start = prepare_start(found.matched, found.cameras, clock, known)
         # The estimate does not change the cameras of an existing database.
-        is_undetermined = cameras is None and _has_guessed_focal_length(found)
+        is_undetermined = cameras is None and _has_assumed_focal_length(found)
         fixed_intrinsics = start.limits == FORWARD_MOTION or is_undetermined
         written = start.matched
         names = images.image_set.images.names
@@ -513,7 +513,7 @@ def _match_images(
     return replace(found, warnings=(*found.warnings, warning))
 
 
-def _has_guessed_focal_length(found: ImageMatches) -> bool:
+def _has_assumed_focal_length(found: ImageMatches) -> bool:
     """Whether a joint estimate registers images whose focal length it does not determine."""
     return isinstance(found, JointMatches) and any(
         not camera.has_prior_focal_length

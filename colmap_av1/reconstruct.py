@@ -99,9 +99,9 @@ class ReconstructReport:
         num_observations: number of observations of all points.
         coverage: share of the images' cells of 16x16 pixels that contain projected points.
         mean_error: mean reprojection error in pixels.
-        far_views: long-range epipolar error in pixels: its median over pairs of images at least ten
+        long_range: median long-range epipolar error in pixels, over pairs of images at least ten
             images apart that see the same place; None if there are no such pairs.
-        far_views_largest: 90th percentile of the long-range epipolar error.
+        long_range_largest: 90th percentile of the long-range epipolar error.
         read_outs: rolling-shutter read-out time of each video in milliseconds, from the first row
             to the last; None if the tracks were not corrected for it.
         place: where the model lies in the world, as in `place.json`.
@@ -135,8 +135,8 @@ class ReconstructReport:
     num_observations: int
     coverage: float
     mean_error: float
-    far_views: float | None
-    far_views_largest: float | None
+    long_range: float | None
+    long_range_largest: float | None
     read_outs: tuple[float | None, ...]
     place: Place
     focal_lengths: tuple[float, float]
@@ -226,6 +226,7 @@ def reconstruct(
             masks.check([own.picture_size], names, options.match.images)
     context = RunContext.of(options.match.run, clock, progress)
     with open_stages(output, "reconstruct") as stages, ExitStack() as opened:
+        _remove_earlier_layout(stages)
         sources = tuple(
             opened.enter_context(
                 open_source(
@@ -257,6 +258,17 @@ def reconstruct(
     return report
 
 
+def _remove_earlier_layout(stages: Path) -> None:
+    """Remove the models that earlier versions kept in folders of the stages.
+
+    Trainers that search the whole output folder would find them.
+    """
+    for folder in (stages, *stages.parent.glob(f"model_*/{stages.name}")):
+        for name in ("poses", "placed", "adjusted", "in_place"):
+            for file in (folder / name).rglob("*.bin"):
+                file.unlink()
+
+
 def _as_converted(options: ReconstructOptions) -> MatchOptions:
     """The options for the conversion of videos."""
     if not options.mapping.adjust:
@@ -277,10 +289,10 @@ def _run_stages(run: Run) -> ReconstructReport:
     del videos  # These tracks are as large as those in `posed`.
     placed, written = written_model(run, posed, image_set)
     further, not_registered = further_models(run, posed, image_set)
-    assert posed.far_views is not None
+    assert posed.long_range is not None
     matches, poses, model = posed.matches.result, posed.last.result, written.result
     implausible = focal_length_warning(read_posed_model(run.stages / poses.poses).cameras.values())
-    long_range = posed.far_views.result
+    long_range = posed.long_range.result
     return ReconstructReport(
         output=run.output,
         videos=tuple(source.pictures.path for source in run.sources),
@@ -300,8 +312,8 @@ def _run_stages(run: Run) -> ReconstructReport:
         num_observations=model.num_observations,
         coverage=model.coverage,
         mean_error=model.mean_error,
-        far_views=long_range.far_views,
-        far_views_largest=long_range.far_views_largest,
+        long_range=long_range.median,
+        long_range_largest=long_range.largest,
         read_outs=tuple(stage.result.read_out for stage in tracked),
         place=placed.result.place,
         focal_lengths=model.focal_lengths,
@@ -380,8 +392,8 @@ def _warnings(
         )
     if matches.depth.warning is not None:
         warnings.append(matches.depth.warning)
-    if posed.far_views is not None and posed.far_views.result.far_views_warning is not None:
-        warnings.append(posed.far_views.result.far_views_warning)
+    if posed.long_range is not None and posed.long_range.result.warning is not None:
+        warnings.append(posed.long_range.result.warning)
     if posed.adjustment is not None and posed.adjustment.result.seams_warning is not None:
         warnings.append(posed.adjustment.result.seams_warning)
     if model.agreeing < LEAST_AGREEING:

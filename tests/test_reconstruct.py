@@ -435,14 +435,14 @@ def test_failed_long_range_check_adds_loop_closures(
     """Without links, a warning suggests them instead."""
     monkeypatch.setattr("colmap_av1.poses.long_range._MAX_ERROR", 0.0)
     options = replace(OPTIONS, match=replace(OPTIONS.match, links=LinkOptions(links)))
-    for name in ("far_views", "seams"):
+    for name in ("long_range", "seams"):
         (copy / ".stages" / f"{name}.json").unlink()
     found = reconstruct(SCENE, copy, options=options)
     assert found.links.looked_again == (links == "auto")
     assert (found.links.num_images > 0) == (links == "auto")
     assert found.num_registered == NUM_IMAGES
     assert any("--links sift" in warning for warning in found.warnings) == (links == "none")
-    assert "far_views" in reconstruct(SCENE, copy, options=options).resumed
+    assert "long_range" in reconstruct(SCENE, copy, options=options).resumed
 
 
 def test_warning_names_images_that_are_not_registered(

@@ -25,13 +25,13 @@ class ModelCheck:
         figures: numbers of images and points, errors and focal length.
         seams: the points that join neighbouring images.
         crossings: the matches across neighbouring images; None without a database.
-        far_views: the long-range check; None without an image folder.
+        long_range: the long-range check; None without an image folder.
     """
 
     figures: ModelFigures
     seams: Seams
     crossings: Crossings | None
-    far_views: LongRangeErrors | None
+    long_range: LongRangeErrors | None
 
     @property
     def seam_warnings(self) -> tuple[str, ...]:
@@ -42,7 +42,7 @@ class ModelCheck:
     @property
     def warnings(self) -> tuple[str, ...]:
         """All warnings; none if nothing is wrong with the model."""
-        far_warning = self.far_views.warning() if self.far_views else None
+        far_warning = self.long_range.warning() if self.long_range else None
         return (*((far_warning,) if far_warning is not None else ()), *self.seam_warnings)
 
 
@@ -59,7 +59,7 @@ def check_model(
         model: the model, or its folder.
         image_path: folder of its images, for the long-range check.
         database: COLMAP database of its matches, which is not changed.
-        progress: called with the stage "far views", the amount of work done, and the total.
+        progress: called with the stage "long range", the amount of work done, and the total.
 
     Raises:
         ModelError: the model cannot be read or has no poses.
@@ -75,13 +75,13 @@ def check_model(
     if not isinstance(model, pycolmap.Reconstruction):
         model = read_model(model)
     # The long-range check comes first, because it raises if images are missing.
-    far_views = None
+    long_range = None
     if image_path is not None:
         progress = progress if progress is not None else no_progress
-        far_views = model_long_range_errors(model, Path(image_path), progress)
+        long_range = model_long_range_errors(model, Path(image_path), progress)
     return ModelCheck(
         figures=model_figures(model),
         seams=model_seams(model),
         crossings=None if database is None else model_crossings(model, Path(database)),
-        far_views=far_views,
+        long_range=long_range,
     )

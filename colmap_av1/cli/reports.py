@@ -75,7 +75,7 @@ def _estimate_rows(estimate: JointEstimate, num_images: int) -> Rows:
     return [
         ("joint estimate", f"{registered} of {num_images} images registered"),
         *_dynamic_row(estimate.moving),
-        *_long_range_rows(estimate.far_views, estimate.far_views_largest),
+        *_long_range_rows(estimate.long_range, estimate.long_range_largest),
         _focal_length_row(estimate.focal_lengths),
     ]
 
@@ -90,8 +90,8 @@ def map_rows(report: MapReport) -> Rows:
         ("mean track length", f"{figures.mean_track_length:.2f}"),
         _focal_length_row(figures.focal_lengths),
     ]
-    if report.far_views is not None:
-        rows += _long_range_rows(report.far_views.median, report.far_views.largest)
+    if report.long_range is not None:
+        rows += _long_range_rows(report.long_range.median, report.long_range.largest)
     rows += _place_rows(report.place)
     if len(report.num_registered) > 1:
         others = ", ".join(map(str, report.num_registered[1:]))
@@ -131,7 +131,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("points", f"{report.num_points}, {report.num_observations} observations"),
         ("coverage", f"{report.coverage:.1%} of the images"),
         ("reprojection error", f"{report.mean_error:.3f} px"),
-        *_long_range_rows(report.far_views, report.far_views_largest),
+        *_long_range_rows(report.long_range, report.long_range_largest),
         _focal_length_row(report.focal_lengths),
         *_shutter_row(report.read_outs),
         *_place_rows(report.place),
@@ -175,13 +175,13 @@ def _long_range_rows(median: float | None, largest: float | None) -> Rows:
 
 def model_rows(found: ModelCheck) -> Rows:
     """Figures of a model and of its long-range check."""
-    figures, far_views = found.figures, found.far_views
+    figures, long_range = found.figures, found.long_range
     return [
         ("images", f"{figures.num_registered} registered"),
         ("points", f"{figures.num_points}, mean track length {figures.mean_track_length:.2f}"),
         ("coverage", f"{figures.coverage:.1%} of the images"),
         ("mean reprojection error", f"{figures.mean_error:.3f} px"),
-        *(_long_range_rows(far_views.median, far_views.largest) if far_views else ()),
+        *(_long_range_rows(long_range.median, long_range.largest) if long_range else ()),
         _focal_length_row(figures.focal_lengths),
     ]
 

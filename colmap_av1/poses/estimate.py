@@ -67,7 +67,7 @@ class Posed:
         moving: masks that exclude dynamic objects, by image name.
         has_picture_positions: whether tracks have positions in the pictures; false if they were
             corrected for a rolling shutter.
-        far_views: the long-range check; None if it was not made.
+        long_range: the long-range check; None if it was not made.
         rival: the adjustment of the first mapping if a second one replaced it, but fits the
             observations hardly better; else None.
     """
@@ -81,7 +81,7 @@ class Posed:
     links: Tracks
     moving: dict[str, Mask]
     has_picture_positions: bool
-    far_views: Kept[LongRangeResult] | None = None
+    long_range: Kept[LongRangeResult] | None = None
     rival: Kept[AdjustedResult] | None = None
 
     @property
@@ -98,7 +98,7 @@ class Posed:
             "resection": self.resection,
             "moving": self.dynamic,
             "adjustment": self.adjustment,
-            "far_views": self.far_views,
+            "long_range": self.long_range,
         }
         return [name for name, stage in stages.items() if stage is not None and stage.resumed]
 
@@ -198,7 +198,7 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
             posed = split(found, other)
         except ModelError:  # too few tracks agree with its poses
             return _FirstModel(None)
-        is_apart = posed.far_views is not None and posed.far_views.result.apart
+        is_apart = posed.long_range is not None and posed.long_range.result.apart
         is_larger = posed.last.result.num_registered > size
         return _FirstModel(other if is_larger and not is_apart else None)
 
@@ -240,7 +240,7 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
             break
         adjusted = posed.adjustment.result
         seams: Sequence[tuple[str, str]] = adjusted.thin_seams
-        if posed.far_views is not None and posed.far_views.result.apart:
+        if posed.long_range is not None and posed.long_range.result.apart:
             seams = adjusted.doubtful_seams
         seams = sorted({*seams, *adjusted.turns})
         if not seams:
@@ -264,16 +264,16 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
             tracks=posed.tracks.split_after_frames(frames),
         )
         posed = replace(posed, adjustment=_adjusted(run, posed, image_set, parts, number=number))
-        if posed.far_views is not None:
-            posed = replace(posed, far_views=_long_range_check(run, posed, image_set))
+        if posed.long_range is not None:
+            posed = replace(posed, long_range=_long_range_check(run, posed, image_set))
     return posed
 
 
 def _are_unlinked_and_apart(run: Run, posed: Posed) -> bool:
     """Whether pictures far apart contradict the poses, and no loop closures were looked for."""
-    assert posed.far_views is not None
+    assert posed.long_range is not None
     looked = run.options.match.links.links != "auto" or posed.matches.result.links.looked_again
-    return posed.far_views.result.apart and not looked
+    return posed.long_range.result.apart and not looked
 
 
 def _with_all_links(run: Run) -> Run:
@@ -346,7 +346,7 @@ def _pose_images(
     )
     if _is_doubtful(posed):
         posed = remapped_poses(run, posed, image_set, least_kept=_LEAST_KEPT)
-    return replace(posed, far_views=_long_range_check(run, posed, image_set))
+    return replace(posed, long_range=_long_range_check(run, posed, image_set))
 
 
 def _long_range_check(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongRangeResult]:
@@ -374,12 +374,12 @@ def trusted_tracks(
 def _is_doubtful(posed: Posed) -> bool:
     """Whether the adjusted model may be bent where links replace motion.
 
-    Either points connect it poorly somewhere, or it was mapped with a guessed focal length.
+    Either points connect it poorly somewhere, or it was mapped with an assumed focal length.
     """
     if posed.adjustment is None:
         return False
     matches, adjusted = posed.matches.result, posed.adjustment.result
-    is_weak = adjusted.doubtful_seams or adjusted.turns or matches.guessed
+    is_weak = adjusted.doubtful_seams or adjusted.turns or matches.assumes_focal_length
     return bool((matches.links.gaps or matches.links.fast) and is_weak)
 
 

@@ -77,7 +77,7 @@ _SAME_TRACK = 0.01
 # A focal length is determined if its relative standard deviation is below this. On walks with turns
 # the standard deviation is 0.5 % and the true error 0.1 to 0.3 %; on a straight drive they are 1.3
 # and 7 %. With the adjusted focal length, COLMAP's mapper registers all images of the drive; with
-# the initial guess, 5 of 51.
+# the assumed one, 5 of 51.
 _FOCAL_LENGTH_ERROR = 0.03
 # If a larger share of the images is not registered, the estimate has failed.
 _MAX_LEFT = 0.5
@@ -92,16 +92,16 @@ class JointEstimate:
     Attributes:
         num_registered: number of registered images of each model, the largest first. The other
             figures describe the one that was estimated first, mostly the largest.
-        far_views: median long-range epipolar error in pixels, over pairs of images ten or more
+        long_range: median long-range epipolar error in pixels, over pairs of images ten or more
             apart; None if no such images have enough matches.
-        far_views_largest: its 90th percentile.
+        long_range_largest: its 90th percentile.
         moving: share of dynamic pixels, which have no matches.
         focal_lengths: the shortest and the longest focal length of the registered images in pixels.
     """
 
     num_registered: tuple[int, ...]
-    far_views: float | None
-    far_views_largest: float | None
+    long_range: float | None
+    long_range_largest: float | None
     moving: float | None
     focal_lengths: tuple[float, float]
 
@@ -144,7 +144,7 @@ def match_jointly(
     if density.max_sigma is None:
         density = replace(density, max_sigma=0.0)  # the poses show which tracks have drifted
     posed = estimate_poses(run, videos, image_set)
-    far = posed.far_views.result if posed.far_views is not None else None
+    far = posed.long_range.result if posed.long_range is not None else None
     models = [_model_of(run, posed, image_set)]
     # A second mapping would join images across turns, which the mapper of the database then bends.
     further = further_poses(
@@ -186,8 +186,8 @@ def match_jointly(
         warnings=(*matches.link_warnings, *warnings),
         estimate=JointEstimate(
             num_registered=tuple(len(model.placed.images) for model in models),
-            far_views=far.far_views if far is not None else None,
-            far_views_largest=far.far_views_largest if far is not None else None,
+            long_range=far.median if far is not None else None,
+            long_range_largest=far.largest if far is not None else None,
             moving=posed.dynamic.result.moving if posed.dynamic is not None else None,
             focal_lengths=(min(focal), max(focal)),
         ),
@@ -445,7 +445,7 @@ def _cameras(run: Run, image_set: ImageSet, models: Sequence[_Model]) -> list[py
     Cameras of an existing database stay unchanged. If the focal length of a video changes, each of
     its images has its own adjusted camera. Otherwise the images of a video have the adjusted camera
     of its largest model, if the focal length was estimated from tracks or the model determines it;
-    if not, the initial guess.
+    if not, the assumed one.
     """
     if run.cameras is not None:
         return run.cameras.of_images
@@ -468,11 +468,11 @@ def _cameras(run: Run, image_set: ImageSet, models: Sequence[_Model]) -> list[py
             if name in in_model and id(initial[i]) not in sharing:
                 own[id(initial[i])][i] = model.known.cameras[in_model[name]]
         sharing |= own
-        guessed = any(
+        assumed = any(
             not initial[i].has_prior_focal_length for images in own.values() for i in images
         )
         errors = {}
-        if guessed and refines_intrinsics(run.options):
+        if assumed and refines_intrinsics(run.options):
             with run.clock.measure("adjustment"):
                 errors = focal_length_errors(model.known)
         for number, camera in model.known.cameras.items():
@@ -515,8 +515,8 @@ def _warnings(
         image_set: all images.
     """
     warnings = []
-    if far is not None and far.apart and far.far_views_warning is not None:
-        warnings.append(far.far_views_warning)
+    if far is not None and far.apart and far.warning is not None:
+        warnings.append(far.warning)
     if len(models) > 1:
         parts = ", ".join(
             f"{len(images)} from '{images[0].name}' to '{images[-1].name}'"

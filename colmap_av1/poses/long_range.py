@@ -206,7 +206,7 @@ def model_long_range_errors(
     Args:
         reconstruction: pycolmap.Reconstruction whose image names sort in temporal order.
         image_path: folder of the images.
-        progress: called for the stage "far views".
+        progress: called for the stage "long range".
 
     Raises:
         ImageError: an image is missing, unreadable or of another size than its camera.
@@ -233,7 +233,7 @@ def model_long_range_errors(
                 f"the model {wanted[0]}x{wanted[1]}: give the folder of the model's images"
             )
         check.add(index, picture)
-        progress("far views", done, len(check.wanted))
+        progress("long range", done, len(check.wanted))
     return check.result()
 
 

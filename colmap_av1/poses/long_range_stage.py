@@ -34,16 +34,16 @@ class LongRangeResult:
     """What `long_range_stage` found.
 
     Attributes:
-        far_views: median long-range epipolar error in pixels, over pairs of images ten or more
-            apart; None if no such images have enough matches.
-        far_views_largest: its 90th percentile.
-        far_views_warning: warning about it.
+        median: median long-range epipolar error in pixels, over pairs of images ten or more apart;
+            None if no such images have enough matches.
+        largest: its 90th percentile.
+        warning: warning about it.
         apart: whether the images contradict the poses.
     """
 
-    far_views: float | None
-    far_views_largest: float | None
-    far_views_warning: str | None
+    median: float | None
+    largest: float | None
+    warning: str | None
     apart: bool
 
 
@@ -73,15 +73,15 @@ def long_range_stage(
         placed = read_posed_images(run, posed, image_set)
         far = _compared(run, tracks, image_set, moving, placed)
         return LongRangeResult(
-            far_views=far.median,
-            far_views_largest=far.largest,
-            far_views_warning=far.warning(linked=linked),
+            median=far.median,
+            largest=far.largest,
+            warning=far.warning(linked=linked),
             apart=far.are_apart,
         )
 
     return run_stage(
         run.stages,
-        "far_views",
+        "long_range",
         [posed.digest, masked, linked],
         LongRangeResult,
         into=run.stages,
@@ -93,7 +93,7 @@ def long_range_stage(
 def _compared(
     run: Run, tracks: Tracks, image_set: ImageSet, moving: Mapping[str, Mask], placed: PosedImages
 ) -> LongRangeErrors:
-    with run.clock.measure("far views"):
+    with run.clock.measure("long range"):
         points_of = _points_by_image(run, tracks, placed)
         check = LongRangeCheck(placed.images, placed.cameras, points_of.__getitem__)
         masks = placed.masks_with(moving)
@@ -102,7 +102,7 @@ def _compared(
         for done, (place, picture) in enumerate(run.pictures(image_set)(places), start=1):
             index = index_of[place]
             check.add(index, picture, masks[index])
-            run.progress("far views", done, len(places))
+            run.progress("long range", done, len(places))
         return check.result()
 
 

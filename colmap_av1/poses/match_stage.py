@@ -42,7 +42,7 @@ class MatchesResult:
         link_warnings: warnings about cameras and links.
         key_images: indices of the key images.
         num_pose_tracks: number of tracks that the poses are estimated from.
-        guessed: whether the focal length of some video is assumed.
+        assumes_focal_length: whether the focal length of some video is assumed.
         forward_motion: whether the camera moves along its optical axis, see `MatchReport`.
         depth: whether the matches determine depth.
         num_pairs: number of image pairs.
@@ -55,7 +55,7 @@ class MatchesResult:
     link_warnings: tuple[str, ...]
     key_images: tuple[int, ...]
     num_pose_tracks: int
-    guessed: bool
+    assumes_focal_length: bool
     forward_motion: bool
     depth: DepthEvidence
     num_pairs: int
@@ -123,7 +123,7 @@ def match_stage(
             link_warnings=found.warnings,
             key_images=tuple(index),
             num_pose_tracks=len(found.track_lengths),
-            guessed=not all(camera.has_prior_focal_length for camera in of_videos),
+            assumes_focal_length=not all(camera.has_prior_focal_length for camera in of_videos),
             forward_motion=matched.forward_motion,
             depth=found.depth,
             num_pairs=len(configs),

@@ -133,7 +133,9 @@ def pose_stage(
         mappers = [mapping.mapper]
     else:
         # The global mapper needs the focal length. A zoom would mislead its estimate.
-        mappers = ["incremental"] if found_before.guessed else ["global", "incremental"]
+        mappers = (
+            ["incremental"] if found_before.assumes_focal_length else ["global", "incremental"]
+        )
     links = found_before.links
     reasons = {reason for gap in links.gaps for reason in gap.reasons}
     depends_on_links = links.num_between or reasons & {"contradicted", "few tracks"}
@@ -274,7 +276,7 @@ def _why_no_initial_pair(found: MatchesResult, mapper: str) -> str:
             f"{found.num_verified_pairs} of {found.num_pairs} verified pairs: "
             "'colmap-av1 info' tells what the stream lacks, --reencode 1 converts it again"
         )
-    if found.guessed:
+    if found.assumes_focal_length:
         return (
             f"{failure}: the focal length is a default and may be far off, or there is too little "
             "parallax, as when the camera moves along its optical axis: "

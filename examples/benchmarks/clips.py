@@ -29,7 +29,7 @@ EXAMPLES = Path(__file__).resolve().parents[1]
 SEQUENCES = EXAMPLES.parents[1] / "shared" / "sequences"
 REFERENCE = "sift-exhaustive"
 # External tool that compares SIFT matches between images far apart with the poses.
-FAR_VIEWS = SEQUENCES.parent / "tools" / "loop_consistency.py"
+LOOP_CONSISTENCY = SEQUENCES.parent / "tools" / "loop_consistency.py"
 # Smallest number of images between the images of a pair.
 FAR = 10
 # The settings of `colmap-av1 encode --encoder libaom --speed 6`.
@@ -207,7 +207,7 @@ def as_shot(sequence: Sequence, folder: Path) -> Path:
     return video
 
 
-def far_views(model: Path, images: Path, apart: int = FAR) -> dict[str, float]:
+def long_range(model: Path, images: Path, apart: int = FAR) -> dict[str, float]:
     """Long-range epipolar error of a model: columns of a row.
 
     Args:
@@ -219,12 +219,14 @@ def far_views(model: Path, images: Path, apart: int = FAR) -> dict[str, float]:
         Median and 90th percentile over pairs of images in pixels; empty if the program that
         measures it is absent.
     """
-    if not FAR_VIEWS.is_file():
+    if not LOOP_CONSISTENCY.is_file():
         return {}
-    command = [sys.executable, str(FAR_VIEWS), str(model), str(images), str(apart)]
+    command = [sys.executable, str(LOOP_CONSISTENCY), str(model), str(images), str(apart)]
     printed = subprocess.run(command, capture_output=True, text=True, check=False).stdout
     found = re.search(r"median ([\d.]+), 90% ([\d.]+)", printed)
-    return {} if found is None else {"far_views": float(found[1]), "far_views_90": float(found[2])}
+    if found is None:
+        return {}
+    return {"long_range": float(found[1]), "long_range_90": float(found[2])}
 
 
 def known_truth(material: Material) -> Truth:

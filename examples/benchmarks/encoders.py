@@ -73,7 +73,7 @@ class Row:
 
     CPU seconds are those of ffmpeg for each megapixel of a frame, including decoding the source.
     Tracks have at least 4 or 8 frames. Epipolar errors are medians in pixels between observations
-    1 or 8 frames apart. Long-range epipolar errors are described at `clips.far_views`.
+    1 or 8 frames apart. Long-range epipolar errors are described at `clips.long_range`.
     """
 
     clip: str
@@ -91,8 +91,8 @@ class Row:
     points: int | None = None
     error: float | None = None
     ate: float | None = None
-    far_views: float | None = None
-    far_views_90: float | None = None
+    long_range: float | None = None
+    long_range_90: float | None = None
     reconstruct_cpu: float | None = None
 
 
@@ -214,7 +214,7 @@ def modelled(
             poses = model_poses(read_model(output / "sparse" / "0"), sequence.num_frames)
             errors = pose_errors(poses, sequence.cam_from_world)
             facts["ate"] = errors.ate if errors is not None else None
-        facts |= ruler.far_views(output / "sparse" / "0", output / "images")
+        facts |= ruler.long_range(output / "sparse" / "0", output / "images")
         shutil.rmtree(output)
         return facts
 

@@ -67,8 +67,8 @@ class Row:
         registered: number of registered images of each model.
         centres_off: largest error of a model's camera centres, as a share of their extent in SIFT's
             model; None if a model has images of two scenes, or without SIFT's model.
-        far_views: median long-range epipolar error in pixels.
-        far_views_90: its 90th percentile.
+        long_range: median long-range epipolar error in pixels.
+        long_range_90: its 90th percentile.
         revisits: number of loop closures.
         between: number of SIFT links between videos.
         links_cpu_s: CPU seconds of SIFT links and loop closures.
@@ -80,8 +80,8 @@ class Row:
     images: int
     registered: str
     centres_off: float | None
-    far_views: float | None
-    far_views_90: float | None
+    long_range: float | None
+    long_range_90: float | None
     revisits: int
     between: int
     links_cpu_s: float
@@ -134,7 +134,7 @@ def measure(case: str, cache: Path, console: Console) -> Row:
         images=report.num_images,
         registered=" and ".join(str(model.num_reg_images()) for model in models),
         centres_off=None if None in off else max(value for value in off if value is not None),
-        **far_views(outputs[0], APART.get(case, ruler.FAR)),
+        **long_range(outputs[0], APART.get(case, ruler.FAR)),
         revisits=report.links.num_revisits,
         between=report.links.num_between,
         links_cpu_s=report.cpu_seconds.get("links", 0.0),
@@ -174,10 +174,10 @@ def centres_off(model: Any, clips: Sequence[Clip], wholes: dict[str, Whole]) -> 
     return None if errors is None else errors.ate / errors.extent
 
 
-def far_views(output: Path, apart: int) -> dict[str, float | None]:
+def long_range(output: Path, apart: int) -> dict[str, float | None]:
     """Long-range epipolar error of images at least `apart` images apart: columns of the row."""
-    found = ruler.far_views(output / "sparse" / "0", output / "images", apart)
-    return {name: found.get(name) for name in ("far_views", "far_views_90")}
+    found = ruler.long_range(output / "sparse" / "0", output / "images", apart)
+    return {name: found.get(name) for name in ("long_range", "long_range_90")}
 
 
 if __name__ == "__main__":

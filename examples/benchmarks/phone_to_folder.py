@@ -100,8 +100,8 @@ class Row:
     error_px: float | None = None
     ate: float | None = None
     ate_of_extent: float | None = None
-    far_views: float | None = None
-    far_views_90: float | None = None
+    long_range: float | None = None
+    long_range_90: float | None = None
 
 
 # Options of images, for clips whose images `reconstruct` does not choose itself.
@@ -226,7 +226,7 @@ def measure_match(clip: Clip, folder: Path) -> list[Row]:
         total = replace(sum_of(way, [matched, mapper]), images=num_images)
         if model.is_dir():
             straight = undistorted(model, images, folder / "undistorted")
-            figures = figures_of(clip, model, None, num_images) | ruler.far_views(*straight)
+            figures = figures_of(clip, model, None, num_images) | ruler.long_range(*straight)
             total = replace(total, **figures)
         rows += [mapper, total]
     return rows
@@ -250,7 +250,7 @@ def measure_sift(clip: Clip, folder: Path, names: list[str], *, mapped: bool) ->
     total = replace(sum_of("SIFT sequential", rows), images=len(names))
     if model is not None:
         straight = undistorted(model, images, folder / "undistorted")
-        figures = figures_of(clip, model, None, len(names)) | ruler.far_views(*straight)
+        figures = figures_of(clip, model, None, len(names)) | ruler.long_range(*straight)
         total = replace(total, **figures)
     return [*rows, total]
 
@@ -410,7 +410,7 @@ def figures_of(clip: Clip, model: Path, images: Path | None, num_images: int) ->
         errors = pose_errors(model_poses(reconstruction, len(clip.poses)), clip.poses)
         if errors is not None:
             found |= {"ate": errors.ate, "ate_of_extent": errors.ate / errors.extent}
-    return found if images is None else found | ruler.far_views(model, images)
+    return found if images is None else found | ruler.long_range(model, images)
 
 
 def undistorted(model: Path, images: Path, folder: Path) -> tuple[Path, Path]:

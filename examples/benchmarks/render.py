@@ -288,8 +288,8 @@ def phone_to_folder(rows: list[Row]) -> str:
             return ""
         return compared(ours, sift, "cpu_s", ".0f")
 
-    def far_views(row: Row) -> str:
-        return f"{number(row, 'far_views', '.2f')} / {number(row, 'far_views_90', '.2f')}"
+    def long_range(row: Row) -> str:
+        return f"{number(row, 'long_range', '.2f')} / {number(row, 'long_range_90', '.2f')}"
 
     columns = [
         Column("clip", lambda row: f"`{row['clip']}`" if is_first(row) else ""),
@@ -298,7 +298,7 @@ def phone_to_folder(rows: list[Row]) -> str:
         figure("points", "points", ",.0f"),
         figure("reprojection error", "error_px", ".3f", " px"),
         figure("error of camera centres", "ate_of_extent", ".2%"),
-        Column("long-range epipolar px", far_views),
+        Column("long-range epipolar px", long_range),
         less("seconds", "seconds", ".0f"),
         less("CPU seconds", "cpu_s", ".0f"),
         Column("from AV1", from_stream),
@@ -528,7 +528,7 @@ def encoders(rows: list[Row]) -> str:
         figure("points", "points", ",.0f"),
         figure("error px", "error", ".3f"),
         figure("ATE", "ate", ".4f"),
-        pair("long-range epipolar px", "far_views", "far_views_90", ".2f"),
+        pair("long-range epipolar px", "long_range", "long_range_90", ".2f"),
     ]
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
 
@@ -635,15 +635,15 @@ def one_model(rows: list[Row]) -> str:
     def links_share(row: Row) -> str:
         return f"{float(row['links_cpu_s']) / float(row['cpu_s']):.0%}"
 
-    def far_views(row: Row) -> str:
-        return f"{float(row['far_views']):.2f} / {float(row['far_views_90']):.2f}"
+    def long_range(row: Row) -> str:
+        return f"{float(row['long_range']):.2f} / {float(row['long_range_90']):.2f}"
 
     columns = [
         words("case", "case"),
         words("images", "images"),
         words("registered", "registered"),
         figure("distance to SIFT's centres / extent", "centres_off", ".2%"),
-        Column("long-range epipolar px", far_views),
+        Column("long-range epipolar px", long_range),
         words("revisits", "revisits"),
         words("links between videos", "between"),
         figure("CPU s", "cpu_s", ".0f"),

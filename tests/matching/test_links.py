@@ -268,8 +268,8 @@ def test_gap_that_pictures_contradict_is_linked(
 @pytest.mark.slow
 def test_model_of_a_clip_with_a_jerk_has_correct_poses(jerk: Path, tmp_path: Path) -> None:
     made = reconstruct(jerk, tmp_path / "out", options=ReconstructOptions())
-    assert made.far_views is not None
-    assert made.far_views < 0.6
+    assert made.long_range is not None
+    assert made.long_range < 0.6
     _check_poses(made, LEFT_OUT, 0.005)
 
 

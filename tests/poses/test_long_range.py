@@ -38,7 +38,7 @@ def bent(made: ReconstructReport, tmp_path_factory: pytest.TempPathFactory) -> P
 def test_consistent_model_passes(made: ReconstructReport) -> None:
     model = read_model(made.output / "sparse" / "0")
     found = model_long_range_errors(model, made.output / "images")
-    assert found.median == pytest.approx(made.far_views, rel=0.05)
+    assert found.median == pytest.approx(made.long_range, rel=0.05)
     assert found.median is not None
     assert found.median < 1
     assert found.warning() is None
