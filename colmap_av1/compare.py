@@ -71,8 +71,8 @@ def compare(
     *,
     image_path: str | os.PathLike[str] | None = None,
     reference: str | os.PathLike[str] | None = None,
-    options: CompareOptions | None = None,
-    progress: Progress | None = None,
+    options: CompareOptions = CompareOptions(),
+    progress: Progress = no_progress,
 ) -> CompareReport:
     """Compare this package's matches with those of other front-ends on one video.
 
@@ -105,8 +105,6 @@ def compare(
         OptionError: a front-end is unknown, or the folder has other content.
         EvaluationError: a package is missing that the report, a front-end or the trainer needs.
     """
-    options = options if options is not None else CompareOptions()
-    progress = progress if progress is not None else no_progress
     output = Path(output)
     write_report = _report_writer()
     # Front-ends run in separate processes: keep the converted stream, so that they share it.

@@ -102,8 +102,8 @@ def densify(
     photos: str | os.PathLike[str] | None = None,
     image_path: str | os.PathLike[str] | None = None,
     gaussians: str | os.PathLike[str] | None = None,
-    options: DensifyOptions | None = None,
-    progress: Progress | None = None,
+    options: DensifyOptions = DensifyOptions(),
+    progress: Progress = no_progress,
     overwrite: bool = False,
 ) -> DensifyReport:
     """Triangulate the tracks of videos on the poses of an existing model.
@@ -140,8 +140,6 @@ def densify(
         >>> report.num_images, report.num_points > 2 * report.num_model_points
         (10, True)
     """
-    options = options if options is not None else DensifyOptions()
-    progress = progress if progress is not None else no_progress
     model, output = Path(model), Path(output)
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()

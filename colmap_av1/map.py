@@ -80,9 +80,9 @@ def map_database(
     image_path: str | os.PathLike[str],
     output: str | os.PathLike[str],
     *,
-    options: MapOptions | None = None,
-    place: PlaceOptions | None = None,
-    progress: Progress | None = None,
+    options: MapOptions = MapOptions(),
+    place: PlaceOptions = PlaceOptions(),
+    progress: Progress = no_progress,
     overwrite: bool = False,
 ) -> MapReport:
     """Map a COLMAP database of any origin, which is not changed.
@@ -115,9 +115,6 @@ def map_database(
         >>> report.model.as_posix()
         'my_model/0'
     """
-    options = options if options is not None else MapOptions()
-    place = place if place is not None else PlaceOptions()
-    progress = progress if progress is not None else no_progress
     database, image_path, output = Path(database), Path(image_path), Path(output)
     clock = Clock()
     check_new_folder(output, MODEL_FILES, [database, image_path], overwrite=overwrite)

@@ -201,8 +201,8 @@ def match(
     *,
     photos: str | os.PathLike[str] | None = None,
     image_path: str | os.PathLike[str] | None = None,
-    options: MatchOptions | None = None,
-    progress: Progress | None = None,
+    options: MatchOptions = MatchOptions(),
+    progress: Progress = no_progress,
 ) -> MatchReport:
     """Fill a COLMAP database with keypoints and verified matches from the motion of videos.
 
@@ -244,8 +244,6 @@ def match(
         >>> print(report.next_commands[1])
         colmap-av1 map --database my.db --image_path my_frames --output my_model
     """
-    options = options if options is not None else MatchOptions()
-    progress = progress if progress is not None else no_progress
     database = Path(database)
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()

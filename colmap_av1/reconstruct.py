@@ -164,8 +164,8 @@ def reconstruct(
     photos: str | os.PathLike[str] | None = None,
     gaussians: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
-    options: ReconstructOptions | None = None,
-    progress: Progress | None = None,
+    options: ReconstructOptions = ReconstructOptions(),
+    progress: Progress = no_progress,
 ) -> ReconstructReport:
     """Make a dense model of videos, in a folder that trainers of Gaussian splats open.
 
@@ -205,8 +205,7 @@ def reconstruct(
         >>> report.num_frames, report.num_images, report.num_registered
         (60, 10, 10)
     """
-    options = (options if options is not None else ReconstructOptions()).with_extension
-    progress = progress if progress is not None else no_progress
+    options = options.with_extension
     output = Path(output)
     clock = Clock()
     check_apart(output, [*paths_of(video), photos, *options.match.files])

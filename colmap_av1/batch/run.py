@@ -96,7 +96,7 @@ def run_batch(
     task: Options,
     *,
     models: str | os.PathLike[str] | None = None,
-    options: BatchOptions | None = None,
+    options: BatchOptions = BatchOptions(),
     on_start: Callable[[str], None] | None = None,
     on_progress: OnProgress | None = None,
 ) -> BatchReport:
@@ -127,7 +127,6 @@ def run_batch(
         >>> report.num_videos, report.num_done, report.failed
         (2, 1, {'unreadable': 1})
     """
-    options = options if options is not None else BatchOptions()
     words = [inputs] if isinstance(inputs, (str, os.PathLike)) else inputs
     place = absolute(os.fspath(output))
     work = _work_of(task, place, None if models is None else os.fspath(models), options)

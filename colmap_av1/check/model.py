@@ -51,7 +51,7 @@ def check_model(
     *,
     image_path: str | os.PathLike[str] | None = None,
     database: str | os.PathLike[str] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> ModelCheck:
     """Check whether the poses of a model are consistent.
 
@@ -77,7 +77,6 @@ def check_model(
     # The long-range check comes first, because it raises if images are missing.
     long_range = None
     if image_path is not None:
-        progress = progress if progress is not None else no_progress
         long_range = model_long_range_errors(model, Path(image_path), progress)
     return ModelCheck(
         figures=model_figures(model),

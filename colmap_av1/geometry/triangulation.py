@@ -85,7 +85,7 @@ class TriangulatedPoints:
 def triangulate(
     observations: Observations,
     views: Views,
-    options: TriangulateOptions | None = None,
+    options: TriangulateOptions = TriangulateOptions(),
     *,
     num_threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -103,14 +103,13 @@ def triangulate(
     Args:
         observations: the tracks.
         views: poses and focal lengths.
-        options: criteria for points; the defaults of TriangulateOptions if None.
+        options: criteria for points.
         num_threads: number of threads; None: one per CPU. The result does not depend on it.
         progress: called with the number of tracks done so far.
 
     Returns:
         The points, in the order of the tracks.
     """
-    options = options if options is not None else TriangulateOptions()
     offsets = observations.offsets
     cam_from_world = np.ascontiguousarray(views.cam_from_world)
     focal = np.ascontiguousarray(views.focal)

@@ -66,8 +66,8 @@ class HlocMatches:
 def export_hloc(
     database: str | os.PathLike[str],
     output: str | os.PathLike[str],
-    options: ExportOptions | None = None,
-    progress: Progress | None = None,
+    options: ExportOptions = ExportOptions(),
+    progress: Progress = no_progress,
     *,
     overwrite: bool = False,
 ) -> tuple[int, int]:
@@ -99,9 +99,7 @@ def export_hloc(
         >>> export_hloc("my.db", "my_hloc")
         (10, 45)
     """
-    options = options if options is not None else ExportOptions()
     path, folder = Path(database), Path(output)
-    report = progress if progress is not None else no_progress
     if is_new(path):
         raise DatabaseError(f"{path}: no such file, or empty: give the path of a COLMAP database")
     for name in (FEATURES, MATCHES, PAIRS):
@@ -110,12 +108,12 @@ def export_hloc(
         names = dict(connection.execute("SELECT image_id, name FROM images").fetchall())
         _check_names(path, sorted(names.values()))
         with _complete_files(folder) as (features, matches, pairs):
-            counts = _write_features(connection, path, features, report)
+            counts = _write_features(connection, path, features, progress)
             if not any(counts.values()):
                 raise DatabaseError(f"{path}: has no keypoints: match its images first")
             num_pairs = _write_pairs(
                 connection, path, matches, pairs, names=names, counts=counts,
-                options=options, report=report,
+                options=options, report=progress,
             )  # fmt: skip
     return len(counts), num_pairs
 

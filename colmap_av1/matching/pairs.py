@@ -149,7 +149,7 @@ def pair_matches(a: ImageKeypoints, b: ImageKeypoints) -> NDArray[np.uint32]:
 
 
 def schedule_pairs(
-    keypoints: Sequence[ImageKeypoints], options: PairOptions | None = None
+    keypoints: Sequence[ImageKeypoints], options: PairOptions = PairOptions()
 ) -> NDArray[np.int32]:
     """Choose the image pairs to write: every distance for near images, growing distances for far.
 
@@ -160,13 +160,12 @@ def schedule_pairs(
 
     Args:
         keypoints: the images' keypoints, in display order.
-        options: offsets and thresholds; the defaults of PairOptions if None.
+        options: offsets and thresholds.
 
     Returns:
         int32 [m, 2] indices into `keypoints`, first < second, in ascending order; each pair
         shares at least `options.min_matches` tracks.
     """
-    options = options if options is not None else PairOptions()
     limit = _longest_track_span(keypoints)
     if options.max_span is not None:
         limit = min(limit, options.max_span)

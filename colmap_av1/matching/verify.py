@@ -51,7 +51,7 @@ def verify_pairs(
     pairs: NDArray[np.int32],
     matches: Sequence[NDArray[np.uint32]],
     cameras: pycolmap.Camera | Sequence[pycolmap.Camera],
-    options: VerifyOptions | None = None,
+    options: VerifyOptions = VerifyOptions(),
     *,
     num_threads: int | None = None,
     seed: int = 0,
@@ -70,7 +70,7 @@ def verify_pairs(
         matches: for each pair, uint32 [n, 2] indices of matching keypoints.
         cameras: one camera for all images, or one for each; images that share a camera hold the
             same object.
-        options: thresholds and effort; the defaults of VerifyOptions if None.
+        options: thresholds and effort.
         num_threads: number of threads; if None, at most one per CPU that the process may use.
         seed: seed of the robust estimators.
         progress: called with the number of pairs done so far, from this thread, in order.
@@ -82,7 +82,6 @@ def verify_pairs(
     Raises:
         OptionError: a camera maps no keypoint to a ray in front of it.
     """
-    options = options if options is not None else VerifyOptions()
     if isinstance(cameras, pycolmap.Camera):
         cameras = [cameras] * len(keypoints)
     if len(cameras) != len(keypoints) or len(matches) != len(pairs):

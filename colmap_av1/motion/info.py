@@ -94,8 +94,8 @@ class StreamReport:
 
 def read_info(
     video: str | os.PathLike[str],
-    options: ReadOptions | None = None,
-    progress: Progress | None = None,
+    options: ReadOptions = ReadOptions(),
+    progress: Progress = no_progress,
 ) -> StreamReport:
     """Read a whole stream and judge how good its motion is for matching.
 
@@ -114,8 +114,7 @@ def read_info(
         >>> report.num_shown, report.num_key_frames, report.good
         (60, 1, True)
     """
-    options = options if options is not None else ReadOptions()
-    counts = _count(read_motion(video, options), progress or no_progress)
+    counts = _count(read_motion(video, options), progress)
     structure = counts.structure
     if structure.num_shown > 0:
         # Frames that are shown again are not coded frames, and a stream may end with them.

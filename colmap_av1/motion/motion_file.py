@@ -19,7 +19,7 @@ from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
 from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
 from colmap_av1.util.hdf5 import new_hdf5
-from colmap_av1.util.progress import Progress
+from colmap_av1.util.progress import Progress, no_progress
 
 # Zip members have a date. A fixed one makes the bytes of the file reproducible.
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -28,8 +28,8 @@ _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 def export_motion(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],
-    options: ReadOptions | None = None,
-    progress: Progress | None = None,
+    options: ReadOptions = ReadOptions(),
+    progress: Progress = no_progress,
     *,
     overwrite: bool = False,
 ) -> int:
@@ -78,8 +78,7 @@ def export_motion(
                     for name, array in _arrays(frame):
                         write(f"{count:06d}/{name}", array)
                     count += 1
-                    if progress is not None:
-                        progress("motion", count, None)
+                    progress("motion", count, None)
             if count == 0:
                 raise VideoError(f"{video}: has no frames: give another video")
     except OSError as error:

@@ -59,7 +59,7 @@ class _Index:
 
 
 def read_motion(
-    video: str | PathLike[str], options: ReadOptions | None = None
+    video: str | PathLike[str], options: ReadOptions = ReadOptions()
 ) -> Iterator[FrameMotion]:
     """Read the motion of every coded frame of an AV1 video, in bitstream order.
 
@@ -89,7 +89,6 @@ def read_motion(
         >>> len(inter_units), inter_units[0]  # the first frame is a key frame
         (60, 0)
     """
-    options = options if options is not None else ReadOptions()
     index = _read_index(video, options)
     display_index: dict[int, int] = {}
     for number, decode_index in enumerate(index.shown):

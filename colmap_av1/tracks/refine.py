@@ -45,7 +45,7 @@ _SPREAD = DensityOptions(preset="sparse", max_tracks_per_image=2000, spacing=10.
 def refine_tracks(
     tracks: Tracks,
     frames: Iterable[tuple[int, NDArray[np.uint8]]],
-    options: RefineOptions | None = None,
+    options: RefineOptions = RefineOptions(),
     progress: Callable[[int], None] | None = None,
     *,
     expected: NDArray[np.bool_] | None = None,
@@ -67,7 +67,7 @@ def refine_tracks(
         frames: (display index, picture) of the frames in display order, uint8 BGR
             [height, width, 3] or grey [height, width]. Observations in frames that are
             missing keep the bitstream's step.
-        options: how to refine; the defaults of RefineOptions if None.
+        options: how to refine.
         progress: called after each frame with the number of frames so far.
         expected: bool [num_observations] observations that are only predicted, not observed;
             None: none. If such an observation is not found, the picture around it is not used to
@@ -81,7 +81,6 @@ def refine_tracks(
     Raises:
         ImageError: a picture differs in size from the tracks' frames, or comes out of order.
     """
-    options = options if options is not None else RefineOptions()
     if options.refine == "none":
         return tracks
     state = match_tracks(tracks, frames, options, progress, expected=expected)

@@ -43,7 +43,7 @@ _MAX_ERROR_SHARE = 1 / 30
 _WIDE = 0.8
 
 
-def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Tracks:
+def select_tracks(tracks: Tracks, options: DensityOptions = DensityOptions()) -> Tracks:
     """Select tracks that are long, accurate and spread over every image.
 
     First, observations are removed whose error, relative to the first observation of their track,
@@ -60,13 +60,12 @@ def select_tracks(tracks: Tracks, options: DensityOptions | None = None) -> Trac
 
     Args:
         tracks: tracks of the whole video.
-        options: how many to select; the defaults of DensityOptions if None.
+        options: how many to select.
 
     Returns:
         The selected tracks in the same order, each with at least `min_images` observations. The
         same object if nothing is removed.
     """
-    options = options if options is not None else DensityOptions()
     limits = _limits_of(options)
     if limits.min_images <= 1 and not (
         limits.max_sigma or limits.spacing or limits.max_tracks_per_image

@@ -15,7 +15,7 @@ from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import TrackOptions
 from colmap_av1.util.memory import give_back_free_memory
-from colmap_av1.util.progress import Progress
+from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.display import Display, shown_points, shown_size
 
 # Width in pixels of the units that have motion.
@@ -328,8 +328,8 @@ class Tracks:
 
 def build_tracks(
     motion: Iterable[FrameMotion],
-    options: TrackOptions | None = None,
-    progress: Progress | None = None,
+    options: TrackOptions = TrackOptions(),
+    progress: Progress = no_progress,
     *,
     frames: NDArray[np.int32] | None = None,
 ) -> Tracks:
@@ -350,7 +350,7 @@ def build_tracks(
 
     Args:
         motion: the coded frames of one video, in bitstream order.
-        options: how to chain; the defaults of TrackOptions if None.
+        options: how to chain.
         progress: called after each coded frame with the stage "tracks" and the number of frames so
             far.
         frames: int32 [n] display indices of the frames whose observations are kept, which limits
@@ -375,7 +375,6 @@ def build_tracks(
         >>> print(tracks.lengths.min(), tracks.lengths.max())
         10 60
     """
-    options = options if options is not None else TrackOptions()
     core_options = _core_options(options)
     if frames is not None:
         core_options.observed = frames.tolist()
@@ -386,8 +385,7 @@ def build_tracks(
                 f"build_tracks: motion gives {type(frame).__name__}: give frames of read_motion"
             )
         builder.add(frame)
-        if progress is not None:
-            progress("tracks", count, None)
+        progress("tracks", count, None)
     num_frames, width, height, offsets, frame_index, xy, sigma = builder.finish()
     give_back_free_memory()  # building needs as much memory again as the tracks
     if num_frames == 0:

@@ -80,8 +80,8 @@ def encode(
     overwrite: bool = False,
     strict: bool = False,
     telemetry: bool = True,
-    options: EncodeOptions | None = None,
-    progress: Progress | None = None,
+    options: EncodeOptions = EncodeOptions(),
+    progress: Progress = no_progress,
 ) -> EncodeReport:
     """Convert a video to AV1 with backward references only and a single intra frame.
 
@@ -114,8 +114,6 @@ def encode(
         >>> report.num_frames
         60
     """
-    options = options if options is not None else EncodeOptions()
-    progress = progress if progress is not None else no_progress
     path, output = Path(video), Path(output)
     if output.suffix.lower() not in _FORMATS:
         raise OptionError(f"{output}: give an output that ends in {', '.join(_FORMATS)}")
@@ -189,8 +187,8 @@ def stream_of(
     keep_stream: str | os.PathLike[str],
     *,
     strict: bool = False,
-    options: EncodeOptions | None = None,
-    progress: Progress | None = None,
+    options: EncodeOptions = EncodeOptions(),
+    progress: Progress = no_progress,
 ) -> EncodeReport:
     """The AV1 stream of a video in another codec: the stream kept by an earlier run, or a new one.
 
@@ -211,7 +209,6 @@ def stream_of(
         OptionError: an option has an invalid value, or `keep_stream` names an existing file
             that is not a kept stream.
     """
-    options = options if options is not None else EncodeOptions()
     path = Path(video)
     output = Path(keep_stream)
     if output.suffix.lower() not in _KEPT_FORMATS:

@@ -52,10 +52,10 @@ def view_video(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],
     *,
-    options: ViewOptions | None = None,
-    tracks: TrackOptions | None = None,
-    read: ReadOptions | None = None,
-    progress: Progress | None = None,
+    options: ViewOptions = ViewOptions(),
+    tracks: TrackOptions = TrackOptions(),
+    read: ReadOptions = ReadOptions(),
+    progress: Progress = no_progress,
     overwrite: bool = False,
 ) -> int:
     """Draw motion and tracks over the frames of a video.
@@ -83,9 +83,7 @@ def view_video(
         BitstreamError: the stream is damaged, and `strict` is set or fewer than two frames precede
             the damage.
     """
-    options = options if options is not None else ViewOptions()
-    report = progress if progress is not None else no_progress
-    path, operating_point = Path(output), read.operating_point if read is not None else 0
+    path, operating_point = Path(output), read.operating_point
     count = 0
     with open_stream(video) as stream:
         file = stream.file
@@ -98,9 +96,9 @@ def view_video(
             check_new_file(existing, [video], overwrite=overwrite)
         total = file.likely_num_packets
         chained = build_tracks(
-            read_motion(video, read), tracks, lambda stage, done, _: report(stage, done, total)
+            read_motion(video, read), tracks, lambda stage, done, _: progress(stage, done, total)
         )
-        first = first_showings(video, read if read is not None else ReadOptions())
+        first = first_showings(video, read)
         chained = chained.with_repeats(first[: count_with_repeats(first, chained.num_frames)])
         # The motion was read first: its reader limits the frame size, and the decoder does not.
         opened = read_video(video, operating_point)
@@ -114,7 +112,7 @@ def view_video(
                     break
                 write(side_by_side([panel(picture, drawing, index) for panel in draw]))
                 count += 1
-                report("pictures", count, chained.num_frames)
+                progress("pictures", count, chained.num_frames)
             check_video()
     return count
 

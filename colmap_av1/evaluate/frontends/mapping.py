@@ -40,7 +40,7 @@ class MapperRun:
 
 
 def measure_mapper(
-    database: Path, image_path: Path, folder: Path, options: MapOptions | None = None
+    database: Path, image_path: Path, folder: Path, options: MapOptions = MapOptions()
 ) -> MapperRun:
     """Map a database in a separate process, and measure its time and memory.
 
@@ -50,12 +50,11 @@ def measure_mapper(
         database: COLMAP database with verified matches; a copy of it is mapped.
         image_path: folder of its images, for the points' colours.
         folder: gets the models, `log.txt` and the figures.
-        options: the mapper and its options; the defaults of MapOptions if None.
+        options: the mapper and its options.
 
     Raises:
         EvaluationError: the mapper failed.
     """
-    options = options if options is not None else MapOptions()
     model = folder / "model"
 
     def make() -> dict[str, Any]:
@@ -83,7 +82,7 @@ def measure_mapper(
 
 
 def densify_model(
-    model: Path, footage: Footage, folder: Path, options: DensifyOptions | None = None
+    model: Path, footage: Footage, folder: Path, options: DensifyOptions = DensifyOptions()
 ) -> MapperRun:
     """Triangulate every track of the video on the poses of a model, as `densify` does.
 
@@ -98,7 +97,6 @@ def densify_model(
     Raises:
         ColmapAv1Error: see `densify`.
     """
-    options = options if options is not None else DensifyOptions()
     output = folder / "model"
 
     def make() -> dict[str, Any]:

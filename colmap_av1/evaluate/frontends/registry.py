@@ -10,7 +10,7 @@ from colmap_av1.options import LearnedOptions, MatchOptions
 
 
 def make_frontends(
-    match: MatchOptions | None = None, learned: LearnedOptions | None = None
+    match: MatchOptions = MatchOptions(), learned: LearnedOptions = LearnedOptions()
 ) -> dict[str, Frontend]:
     """All front-ends by name.
 
@@ -18,8 +18,6 @@ def make_frontends(
         match: options of this package's front-ends, except refinement and preset.
         learned: options of the learned front-ends.
     """
-    match = match if match is not None else MatchOptions()
-    learned = learned if learned is not None else LearnedOptions()
     return {
         # "av1-refined" refines tracks in the decoded pictures.
         "av1": av1_frontend("none", "default", match),

@@ -36,8 +36,8 @@ class VideoReadOut:
 
 def estimate_video_read_out(
     video: str | os.PathLike[str],
-    options: ReadOptions | None = None,
-    progress: Progress | None = None,
+    options: ReadOptions = ReadOptions(),
+    progress: Progress = no_progress,
 ) -> VideoReadOut | str:
     """Estimate the time in which the shutter of an AV1 video reads the rows of a picture.
 
@@ -64,10 +64,10 @@ def estimate_video_read_out(
         return "the container has no frame rate"
     if not is_square(opened.display.pixel_aspect):
         return "pixels are not square"
-    context = RunContext(progress=progress if progress is not None else no_progress)
+    context = RunContext(progress=progress)
     tracks = track_video(
         VideoSource(opened, opened),
-        TrackingOptions(options if options is not None else ReadOptions()),
+        TrackingOptions(options),
         one_size=True,
         context=context,
     ).tracks
