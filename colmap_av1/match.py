@@ -26,7 +26,7 @@ from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_prepared
 from colmap_av1.images.recognising import check_content
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
-from colmap_av1.matching.gaps import fast_frames, matching_warnings
+from colmap_av1.matching.gaps import fast_frames, matching_warning
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.initial_pairs import prepare_start
 from colmap_av1.matching.links.report import LinkReport
@@ -314,12 +314,12 @@ def match(
     num_inliers = [len(geometry.inlier_matches) for geometry in written.geometries]
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
     notes += (*positions.warnings, *found.warnings)
-    doubts = (crash, found.depth.warning, focal_length_warning(found.cameras))
-    notes += tuple(doubt for doubt in doubts if doubt is not None)
+    doubts = [crash, found.depth.warning, focal_length_warning(found.cameras)]
     # Few matches do not mean a gap if existing matches of the database may connect the images, or
     # with a joint estimate, which omits matches that only repeat tracks of other pairs.
     if options.on_existing != "append" and not isinstance(found, JointMatches):
-        notes += matching_warnings(written, images.image_set)
+        doubts.append(matching_warning(written, images.image_set))
+    notes += tuple(doubt for doubt in doubts if doubt is not None)
     return MatchReport(
         database=database,
         videos=tuple(own.path for own in inputs.videos),

@@ -128,9 +128,9 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
 
 class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        from importlib.metadata import version  # slow to import
+        from colmap_av1.util.digests import package_version  # slow to import
 
-        print_text(f"{PROGRAM} {version(PROGRAM)}\n")
+        print_text(f"{PROGRAM} {package_version()}\n")
         parser.exit()
 
 

@@ -324,11 +324,10 @@ def few_matches_warning(gaps: Sequence[Gap]) -> str | None:
     )
 
 
-def matching_warnings(matched: MatchedImages, image_set: ImageSet) -> list[str]:
+def matching_warning(matched: MatchedImages, image_set: ImageSet) -> str | None:
     """Warn of gaps with few matches between images of a video."""
     used, counts = used_pairs(matched)
     gaps = few_match_gaps(
         matched.pairs[used], counts[used], image_set.images.names, image_set.sequence.tolist()
     )
-    warning = few_matches_warning(gaps)
-    return [warning] if warning is not None else []
+    return few_matches_warning(gaps)

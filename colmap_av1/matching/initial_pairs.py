@@ -239,7 +239,7 @@ class _Search:
         self._pairs, self._found, self._growth = pairs, found, growth
         self._known_large = dict[int, bool]()
         some = np.flatnonzero(found.certain(FORWARD_MOTION) & found.is_known)
-        some = some[evenly_spread(len(some), min(len(some), _NUM_GROWN))]
+        some = some[evenly_spread(len(some), _NUM_GROWN)]
         grown = [int(growth.registered(pairs[k].tolist()).sum()) for k in some]
         self._large_size = math.ceil(_LARGE * max(grown, default=0))
 

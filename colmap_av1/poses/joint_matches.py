@@ -337,8 +337,7 @@ def _limits(run: Run, image_set: ImageSet, density: DensityOptions) -> DensityOp
 
 def _num_features(run: Run, image_set: ImageSet) -> float:
     """Mean number of SIFT features of a picture, estimated from a few."""
-    count = len(image_set.sequence)
-    some = evenly_spread(count, min(count, _NUM_SAMPLED))
+    some = evenly_spread(len(image_set.sequence), _NUM_SAMPLED)
     sift = cv2.SIFT.create()
     pictures = run.pictures(image_set)(some)
     return float(np.mean([len(sift.detect(smaller_grey(own))) for _, own in pictures]))
@@ -384,7 +383,8 @@ def _first_middle_last(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[np.bo
     """
     first = tracks.offsets[:-1]
     begin, end = view[first], view[tracks.offsets[1:] - 1]
-    span = np.array((1, *_SPANS))[np.searchsorted(_SPANS, end - begin, side="right")]
+    # Three observations span two images or more.
+    span = np.array(_SPANS)[np.searchsorted(_SPANS, end - begin, side="right") - 1]
     # Observations are sorted by track, then by image.
     num_views = int(view.max()) + 1
     place = tracks.track * num_views + view
@@ -394,7 +394,7 @@ def _first_middle_last(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[np.bo
     there = np.take(place, wanted, mode="clip") == number * num_views + at
     middle = first + (tracks.lengths - 1) // 2
     ends = np.column_stack([first, middle, tracks.offsets[1:] - 1])
-    index = np.where(there.all(axis=1, keepdims=True) & (span > 1)[:, None], wanted, ends)
+    index = np.where(there.all(axis=1, keepdims=True), wanted, ends)
     chosen = np.zeros(tracks.num_observations, np.bool_)
     chosen[index.ravel()] = True
     return chosen

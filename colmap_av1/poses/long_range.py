@@ -120,6 +120,9 @@ class LongRangeCheck:
         images: the images with their poses, in display order.
         cameras: pycolmap.Camera by id, of any model.
         points_of: returns float64 [n, 3] the points that an image, given by its index, observes.
+
+    Attributes:
+        wanted: indices of the images whose pictures are needed, ascending.
     """
 
     def __init__(
@@ -131,25 +134,19 @@ class LongRangeCheck:
         self._images = images
         self._cameras = [cameras[image.camera_id] for image in images]
         self._pairs, self._angles = _far_pairs(images, self._cameras, points_of)
-        self._wanted = set(self._pairs.ravel().tolist())
+        self.wanted: list[int] = np.unique(self._pairs).tolist()
         self._features: dict[int, Features] = {}
-
-    @property
-    def wanted(self) -> list[int]:
-        """Indices of the images whose pictures are needed, ascending."""
-        return sorted(self._wanted)
 
     def add(self, index: int, picture: _Image, mask: Mask | None = None) -> None:
         """Extract features from the picture of an image.
 
         Args:
-            index: index of the image.
+            index: index of a wanted image.
             picture: uint8 [height, width, 3], BGR, of the size of its camera.
             mask: which pixels are used; None for all.
         """
-        if index in self._wanted:
-            features = extract_features(picture, _NUM_FEATURES)
-            self._features[index] = masked_features(features, picture, mask)
+        features = extract_features(picture, _NUM_FEATURES)
+        self._features[index] = masked_features(features, picture, mask)
 
     def result(self) -> LongRangeErrors:
         """Match the pairs and compute their errors, after all `wanted` images have been added."""
@@ -265,7 +262,7 @@ def _far_pairs(
     found.sort(key=lambda pair: (pair[0] - pair[1], pair[0]))
     half = _NUM_PAIRS // 2
     rest = sorted(found[half:])
-    spread = rest[:: max(1, -(-len(rest) // half))] if rest else []
+    spread = rest[:: max(1, -(-len(rest) // half))]
     pairs = found[:half] + spread[:half]
     return (
         np.array([pair[:2] for pair in pairs], np.int32).reshape(-1, 2),

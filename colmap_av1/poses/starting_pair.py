@@ -102,7 +102,7 @@ def _candidates(
     by_view = np.argsort(view, kind="stable")
     bounds = np.searchsorted(view[by_view], np.arange(1, len(images)))
     seen = np.split(point[by_view], bounds)
-    for first in evenly_spread(len(images), min(len(images), _NUM_FIRST)):
+    for first in evenly_spread(len(images), _NUM_FIRST):
         for second in (first + span for span in _SPANS if first + span < len(images)):
             common = np.intersect1d(seen[first], seen[second], assume_unique=True)
             if len(common) < _ENOUGH:

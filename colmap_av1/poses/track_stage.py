@@ -188,8 +188,7 @@ def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages
     """
     source = run.sources[video]
     count = count_frames(source)
-    most = min(count, _CANDIDATES * run.options.max_images)
-    candidates = np.array(evenly_spread(count, most), dtype=np.int32)
+    candidates = np.array(evenly_spread(count, _CANDIDATES * run.options.max_images), np.int32)
     width, height = source.stream.picture_size
     held = len(candidates) * width * height / _PIXELS_PER_OBSERVATION
     # Correcting the rolling shutter needs the motion between all neighbouring frames.

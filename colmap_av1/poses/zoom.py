@@ -27,8 +27,8 @@ _GROUP = 5
 # missed, but bends the path by only 0.07 %.
 _MIN_RANGE = 1.03
 _MIN_GAIN = 0.04
-# See `adjust_model`. Poses that a shared camera has bent need many iterations to converge.
-_TRIAL_TOLERANCE, _TOLERANCE = 1e-3, 1e-4
+_TRIAL_TOLERANCE = 1e-3  # see `adjust_model`
+# Poses that a shared camera has bent need many iterations to converge.
 _MAX_STEPS = 60
 _LOG = "zoom.log"
 
@@ -64,7 +64,7 @@ def with_own_cameras(run: Run, model: PosedModel) -> Adjusted:
         params = np.array(camera.params)
         params[list(camera.extra_params_idxs())] = 0.0
         camera.params = params.tolist()
-    return adjust_posed(run, own, log=_LOG, max_steps=_MAX_STEPS, tolerance=_TOLERANCE)
+    return adjust_posed(run, own, log=_LOG, max_steps=_MAX_STEPS)
 
 
 def _zooming_cameras(run: Run, model: PosedModel) -> set[int]:
