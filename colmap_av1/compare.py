@@ -24,6 +24,7 @@ from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses, pose_
 from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
 from colmap_av1.evaluate.training.trainers import check_trainer, train, write_split
+from colmap_av1.geometry.alignment import transform_poses
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.observable import has_observable_depth
 from colmap_av1.options import CompareOptions, DensifyOptions, MapOptions
@@ -347,7 +348,7 @@ def _with_pseudo_truth(given: _Reference, columns: list[Column], footage: Footag
         similarity, errors = fit_similarity(poses, given.poses), pose_errors(poses, given.poses)
         if similarity is None or errors is None or errors.ate > _LARGEST_ATE * errors.extent:
             continue
-        return replace(given, points=similarity.apply(points), cloud_source=name)
+        return replace(given, points=similarity * points, cloud_source=name)
     return given
 
 
@@ -371,13 +372,13 @@ def _measure(
     if reference.poses is not None:
         similarity = fit_similarity(poses, reference.poses)
     if similarity is not None:
-        points = similarity.apply(points)
+        points = similarity * points
         if reference.points is not None and reference.cloud_source != column.name:
             column = replace(column, cloud=cloud_distances(points, reference.points))
         assert reference.poses is not None
         if reference.pose_source != column.name:
             column = replace(column, poses=pose_errors(poses, reference.poses))
-        poses = similarity.apply_to_poses(poses)
+        poses = transform_poses(similarity, poses)
     cloud = Cloud(
         points=points,
         colours=_colours(model),

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
-import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.check.database import DatabaseCheck, check_database
@@ -229,9 +228,7 @@ def _place(
     known = Surroundings(read_pose_priors(database), lines=lines)
     found = find_placement(images, dict(model.cameras), known, options, seed)
     if found.is_moved:
-        how = found.similarity
-        rotation = pycolmap.Rotation3d(how.rotation)
-        model.transform(pycolmap.Sim3d(how.scale, rotation, how.translation))
+        model.transform(found.similarity)
         model.write_binary(folder)
     write_place(output, found)
     return found

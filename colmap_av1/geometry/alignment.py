@@ -34,31 +34,6 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
-class Similarity:
-    """The transform x -> scale * rotation @ x + translation.
-
-    Attributes:
-        scale: positive scale factor.
-        rotation: float64 [3, 3] rotation matrix.
-        translation: float64 [3].
-    """
-
-    scale: float
-    rotation: _Floats
-    translation: _Floats
-
-    def apply(self, points: _Floats) -> _Floats:
-        """Transform points [n, 3]."""
-        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
-
-    def apply_to_poses(self, cam_from_world: _Floats) -> _Floats:
-        """Transform cam_from_world poses [n, 3, 4] to the target world."""
-        rotation = cam_from_world[:, :, :3] @ self.rotation.T
-        translation = self.scale * cam_from_world[:, :, 3] - rotation @ self.translation
-        return np.concatenate([rotation, translation[:, :, None]], axis=2)
-
-
-@dataclass(frozen=True)
 class Up:
     """The up direction in a model.
 
@@ -82,7 +57,7 @@ class PathFit:
         scale_error: relative standard error of the scale.
     """
 
-    similarity: Similarity
+    similarity: pycolmap.Sim3d
     num_used: int
     error: float
     scale_error: float
@@ -122,12 +97,8 @@ def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | 
     )
     if found is None:
         return "the camera path has a different shape"
-    best = found["tgt_from_src"]
-    rough_fit = Similarity(
-        float(best.scale), np.asarray(best.rotation.matrix()), np.asarray(best.translation)
-    )
-    similarity, used = _refined(path, positions, up, rough_fit)
-    away = np.linalg.norm(similarity.apply(path) - positions, axis=1)
+    similarity, used = _refined(path, positions, up, found["tgt_from_src"])
+    away = np.linalg.norm(similarity * path - positions, axis=1)
     if used.mean() < _LEAST_SHARE:
         return f"{np.mean(~used):.0%} of them are {_MAX_ERROR:.0f} m or more from the path"
     error = float(np.sqrt(np.mean(away[used] ** 2)))
@@ -137,6 +108,13 @@ def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | 
     if scale_error > _LARGEST_SCALE_ERROR:
         return f"they scatter by {error:.1f} m over a path of {spread:.1f} m"
     return PathFit(similarity, int(used.sum()), error, float(scale_error))
+
+
+def transform_poses(similarity: pycolmap.Sim3d, cam_from_world: _Floats) -> _Floats:
+    """Transform cam_from_world poses, float64 [n, 3, 4], to the target world of a similarity."""
+    rotation = cam_from_world[:, :, :3] @ np.asarray(similarity.rotation.matrix()).T
+    translation = similarity.scale * cam_from_world[:, :, 3] - rotation @ similarity.translation
+    return np.concatenate([rotation, translation[:, :, None]], axis=2)
 
 
 def east_north_up(places: _Floats, origin: tuple[float, float, float]) -> _Floats:
@@ -162,8 +140,8 @@ def east_north_up(places: _Floats, origin: tuple[float, float, float]) -> _Float
 
 
 def _refined(
-    path: _Floats, positions: _Floats, up: Up, start: Similarity
-) -> tuple[Similarity, NDArray[np.bool_]]:
+    path: _Floats, positions: _Floats, up: Up, start: pycolmap.Sim3d
+) -> tuple[pycolmap.Sim3d, NDArray[np.bool_]]:
     """Least-squares similarity of the inlier positions and the up direction.
 
     Scale and translation depend on the positions only (Umeyama 1991). The up direction contributes
@@ -174,7 +152,7 @@ def _refined(
     """
     found = start
     for _ in range(_ITERATIONS):
-        away = np.linalg.norm(found.apply(path) - positions, axis=1)
+        away = np.linalg.norm(found * path - positions, axis=1)
         used = away <= _MAX_ERROR
         if used.sum() < _LEAST_POSITIONS:
             return found, used
@@ -193,7 +171,8 @@ def _refined(
         if scale <= 0:
             return found, used
         mean = scale * rotation @ path[used].mean(axis=0)
-        found = Similarity(scale, rotation, positions[used].mean(axis=0) - mean)
+        translation = positions[used].mean(axis=0) - mean
+        found = pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation)
     return found, used
 
 

@@ -9,6 +9,7 @@ from dense_points import depth_differences
 
 from colmap_av1.evaluate.metrics.clouds import cloud_distances, point_cloud
 from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses
+from colmap_av1.geometry.alignment import transform_poses
 
 
 def test_distances_of_known_clouds() -> None:
@@ -72,8 +73,8 @@ def test_models_are_aligned_by_their_cameras() -> None:
     assert np.isnan(poses[-1]).all()
     similarity = fit_similarity(image_poses(moved, names), poses[:-1])
     assert similarity is not None
-    np.testing.assert_allclose(similarity.apply(point_cloud(moved)), point_cloud(model), atol=1e-6)
+    np.testing.assert_allclose(similarity * point_cloud(moved), point_cloud(model), atol=1e-6)
     np.testing.assert_allclose(
-        similarity.apply_to_poses(image_poses(moved, names)), poses[:-1], atol=1e-6
+        transform_poses(similarity, image_poses(moved, names)), poses[:-1], atol=1e-6
     )
     assert fit_similarity(np.full_like(poses, np.nan), poses) is None

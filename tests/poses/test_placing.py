@@ -15,10 +15,10 @@ from colmap_av1.database.reading import PosePrior
 from colmap_av1.errors import OptionError
 from colmap_av1.geometry.alignment import (
     PathFit,
-    Similarity,
     Up,
     east_north_up,
     fit_path,
+    transform_poses,
 )
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.options.place import PlaceOptions, parse_distance
@@ -59,10 +59,10 @@ def walk(num: int = 40, *, straight: bool = False) -> NDArray[np.float64]:
     return looking(centres, forward)
 
 
-def elsewhere(seed: int = 3) -> Similarity:
+def elsewhere(seed: int = 3) -> pycolmap.Sim3d:
     """A similarity from metres to the coordinates of a mapper."""
     rotation = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-    return Similarity(0.07, rotation, np.array([1.0, -2.0, 0.5]))
+    return pycolmap.Sim3d(0.07, pycolmap.Rotation3d(rotation), np.array([1.0, -2.0, 0.5]))
 
 
 def images_of(poses: NDArray[np.float64]) -> list[ModelImage]:
@@ -77,12 +77,12 @@ def test_similarity_transforms_poses_like_points() -> None:
     moved = elsewhere()
     poses = walk()
     np.testing.assert_allclose(
-        camera_centres(moved.apply_to_poses(poses)), moved.apply(camera_centres(poses)), atol=1e-12
+        camera_centres(transform_poses(moved, poses)), moved * camera_centres(poses), atol=1e-12
     )
     point = np.array([4.0, 9.0, 1.0])
     before = poses[:, :, :3] @ point + poses[:, :, 3]
-    after = moved.apply_to_poses(poses)
-    seen = after[:, :, :3] @ moved.apply(point[None])[0] + after[:, :, 3]
+    after = transform_poses(moved, poses)
+    seen = after[:, :, :3] @ (moved * point) + after[:, :, 3]
     np.testing.assert_allclose(seen, moved.scale * before, atol=1e-12)
 
 
@@ -103,19 +103,19 @@ def test_path_is_fitted_to_positions_with_noise_and_outliers(straight: bool) -> 
     rng = np.random.default_rng(1)
     measured = positions + rng.normal(0, 0.4, positions.shape)
     measured[[5, 20, 21]] += [[80.0, 0, 0], [0, -500, 30], [0, 0, 15]]
-    mapped = elsewhere().apply_to_poses(poses)
+    mapped = transform_poses(elsewhere(), poses)
     up = Up(up_of_cameras(mapped), np.deg2rad(6))
     found = fit_path(camera_centres(mapped), measured, up, 0)
     assert isinstance(found, PathFit)
     assert found.num_used == 37
-    placed = found.similarity.apply(camera_centres(mapped))
+    placed = found.similarity * camera_centres(mapped)
     assert np.abs(placed - positions).max() < 0.6
     assert found.similarity.scale * elsewhere().scale == pytest.approx(1, abs=0.03)
-    level = found.similarity.rotation @ elsewhere().rotation @ Z
+    level = found.similarity.rotation * (elsewhere().rotation * Z)
     assert angle(level, Z) < 4
     again = fit_path(camera_centres(mapped), measured, up, 0)
     assert isinstance(again, PathFit)
-    assert np.array_equal(again.similarity.rotation, found.similarity.rotation)
+    assert np.array_equal(again.similarity.matrix(), found.similarity.matrix())
 
 
 @pytest.mark.parametrize("straight", [False, True])
@@ -126,12 +126,12 @@ def test_a_third_of_the_positions_may_be_outliers(straight: bool) -> None:
     measured = positions + rng.normal(0, 0.4, positions.shape)
     jumped = rng.permutation(len(measured))[: len(measured) // 3]
     measured[jumped] += rng.normal(0, 800, (len(jumped), 3))
-    mapped = elsewhere().apply_to_poses(poses)
+    mapped = transform_poses(elsewhere(), poses)
     up = Up(up_of_cameras(mapped), np.deg2rad(6))
     found = fit_path(camera_centres(mapped), measured, up, 0)
     assert isinstance(found, PathFit), found
     assert found.num_used == len(measured) - len(jumped)
-    placed = found.similarity.apply(camera_centres(mapped))
+    placed = found.similarity * camera_centres(mapped)
     assert np.abs(placed - positions).max() < 0.6
 
 
@@ -156,9 +156,9 @@ def test_unusable_positions_give_a_reason(move: object, reason: str) -> None:
 def test_up_is_estimated_from_the_camera_orientation(seed: int) -> None:
     """Pitch does no harm if the camera turns, and the mapper's world may have any orientation."""
     world = elsewhere(seed)
-    poses = world.apply_to_poses(walk())
+    poses = transform_poses(world, walk())
     up = up_of_cameras(poses)
-    assert angle(up, world.rotation @ Z) < 4
+    assert angle(up, world.rotation * Z) < 4
     np.testing.assert_allclose(rotation_to_up(up) @ up, Z, atol=1e-9)
     assert np.linalg.det(rotation_to_up(up)) == pytest.approx(1)
 
@@ -170,9 +170,9 @@ def test_up_by_gravity_works_in_any_sensor_axes(order: tuple[int, ...]) -> None:
     rng = np.random.default_rng(0)
     gravity = (poses[:, :, :3] @ -Z)[:, order] * [1, -1, -1] + rng.normal(0, 0.01, (40, 3))
     gravity[7] = np.nan
-    found = up_of_gravity(world.apply_to_poses(poses), gravity)
+    found = up_of_gravity(transform_poses(world, poses), gravity)
     assert found is not None
-    assert angle(found[0], world.rotation @ Z) < 1
+    assert angle(found[0], world.rotation * Z) < 1
     assert found[1] < 2
     assert up_of_gravity(poses, rng.normal(0, 1, (40, 3))) is None
     assert up_of_gravity(poses, np.full((40, 3), np.nan)) is None
@@ -183,7 +183,7 @@ def test_up_is_estimated_from_vertical_lines() -> None:
     world = elsewhere()
     poses = walk()[::5]
     normals = []
-    rough = Rotation.from_rotvec(np.deg2rad([6.0, 3.0, 0])).as_matrix() @ world.rotation @ Z
+    rough = Rotation.from_rotvec(np.deg2rad([6.0, 3.0, 0])).as_matrix() @ (world.rotation * Z)
     for pose in poses:
         picture = np.full((480, 640, 3), 90, np.uint8)
         for x in range(-10, 40, 2):
@@ -195,19 +195,19 @@ def test_up_is_estimated_from_vertical_lines() -> None:
                     pixels = [500 * p[:2] / p[2] + [320, 240] for p in seen]
                     p, q = [tuple(int(16 * v) for v in xy) for xy in pixels]
                     cv2.line(picture, p, q, (230, 230, 230), 5, cv2.LINE_AA, 4)
-        moved = world.apply_to_poses(pose[None])[0]
+        moved = transform_poses(world, pose[None])[0]
         normals.append(vertical_lines(picture, CAMERA, moved, rough))
     found = up_of_lines(normals, rough)
     assert found is not None
-    assert angle(found, world.rotation @ Z) < 0.5
-    assert angle(rough, world.rotation @ Z) > 5
+    assert angle(found, world.rotation * Z) < 0.5
+    assert angle(rough, world.rotation * Z) > 5
     assert up_of_lines([], rough) is None
 
 
 def test_known_distance_between_cameras_or_marks_gives_the_scale() -> None:
     world = elsewhere()
     poses = walk()
-    images = {image.name: image for image in images_of(world.apply_to_poses(poses))}
+    images = {image.name: image for image in images_of(transform_poses(world, poses))}
     centres = camera_centres(poses)
     apart = float(np.linalg.norm(centres[0] - centres[30]))
 
@@ -244,7 +244,7 @@ def test_known_distance_between_cameras_or_marks_gives_the_scale() -> None:
 def test_known_distance_overrides_the_scale_of_positions() -> None:
     poses = walk()
     world = elsewhere()
-    images = images_of(world.apply_to_poses(poses))
+    images = images_of(transform_poses(world, poses))
     centres = camera_centres(poses)
     priors = {
         image.name: PosePrior(1.1 * place, is_cartesian=True)
@@ -256,7 +256,7 @@ def test_known_distance_overrides_the_scale_of_positions() -> None:
         found = find_placement(images, {1: CAMERA}, Surroundings(priors), options, 0)
         assert found.similarity.scale * world.scale == pytest.approx(expected, rel=1e-6)
         moved = camera_centres(
-            found.similarity.apply_to_poses(np.array([i.cam_from_world for i in images]))
+            transform_poses(found.similarity, np.array([i.cam_from_world for i in images]))
         )
         # The centre of the path still comes from the positions.
         np.testing.assert_allclose(moved.mean(axis=0), 1.1 * centres.mean(axis=0), atol=1e-6)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from colmap_av1.errors import ImageError
-from colmap_av1.geometry.alignment import Similarity
+from colmap_av1.geometry.alignment import transform_poses
 from colmap_av1.geometry.colmap_model import camera_centres, posed_images
 from colmap_av1.util.texts import read_lines
 
@@ -60,7 +60,7 @@ class PoseErrors:
 
 def fit_similarity(
     cam_from_world: NDArray[np.float64], truth: NDArray[np.float64]
-) -> Similarity | None:
+) -> pycolmap.Sim3d | None:
     """The similarity that best aligns camera centres with those of other poses (Umeyama 1991).
 
     Args:
@@ -77,13 +77,9 @@ def fit_similarity(
     both = _in_both(cam_from_world, truth)
     if both.sum() < 3:
         return None
-    found = pycolmap.estimate_sim3d(
+    return pycolmap.estimate_sim3d(
         camera_centres(cam_from_world[both]), camera_centres(truth[both])
     )
-    if found is None:
-        return None
-    turn = np.asarray(found.rotation.matrix())
-    return Similarity(float(found.scale), turn, np.asarray(found.translation))
 
 
 def pose_errors(
@@ -107,7 +103,7 @@ def pose_errors(
         return None
     both = _in_both(cam_from_world, truth)
     aligned, true_centres = (
-        similarity.apply_to_poses(cam_from_world[both]),
+        transform_poses(similarity, cam_from_world[both]),
         camera_centres(truth[both]),
     )
     distance = np.linalg.norm(camera_centres(aligned) - true_centres, axis=1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
@@ -12,7 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.database.reading import PosePrior
-from colmap_av1.geometry.alignment import PathFit, Similarity, Up, east_north_up, fit_path
+from colmap_av1.geometry.alignment import PathFit, Up, east_north_up, fit_path
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.options.place import PlaceOptions, parse_distance
 from colmap_av1.poses.placing.distance import model_distance
@@ -31,7 +31,6 @@ Lines = Callable[[_Floats], Sequence[_Floats]]
 PLACE_FILE = "place.json"
 # Standard errors in radians of the up direction from gravity, and from how the camera was held.
 _GRAVITY_ERROR, _CAMERA_ERROR = np.deg2rad(2.0), np.deg2rad(6.0)
-_IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ class Placement:
         warnings: warnings about the placement.
     """
 
-    similarity: Similarity = _IDENTITY
+    similarity: pycolmap.Sim3d = field(default_factory=pycolmap.Sim3d)
     units: str = "arbitrary"
     axes: str = "of the mapper"
     origin: Origin | None = None
@@ -89,7 +88,7 @@ class Placement:
     @property
     def is_moved(self) -> bool:
         """Whether the model is transformed."""
-        return self.similarity is not _IDENTITY
+        return not np.array_equal(self.similarity.matrix(), np.eye(3, 4))
 
     @property
     def place(self) -> Place:
@@ -100,7 +99,7 @@ class Placement:
             origin=self.origin,
             how=self.how,
             scale=float(self.similarity.scale),
-            rotation=tuple(tuple(row) for row in self.similarity.rotation.tolist()),
+            rotation=tuple(tuple(row) for row in self.similarity.rotation.matrix().tolist()),
             translation=tuple(self.similarity.translation.tolist()),
         )
 
@@ -149,7 +148,7 @@ def find_placement(
         found = _by_positions(images, poses, known, seed)
     if options.upright and not found.is_moved:
         up, how = _up(poses, known)
-        turned = Similarity(1.0, rotation_to_up(up), np.zeros(3))
+        turned = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation_to_up(up)), np.zeros(3))
         found = replace(found, similarity=turned, axes="z up", how=(f"z up by {how}",))
     if options.scale is not None:
         found = _with_distance(found, images, cameras, options.scale)
@@ -230,9 +229,9 @@ def _with_distance(
     scale = known.metres / distance
     centre = camera_centres(np.array([image.cam_from_world for image in images])).mean(axis=0)
     # Scaling about the mean camera centre keeps the model at its GPS positions.
-    fixed = before.apply(centre[None])[0] if found.units == "metres" else np.zeros(3)
+    fixed = before * centre if found.units == "metres" else np.zeros(3)
     factor = scale / before.scale
-    moved = replace(before, scale=scale, translation=fixed + factor * (before.translation - fixed))
+    moved = pycolmap.Sim3d(scale, before.rotation, fixed + factor * (before.translation - fixed))
     how = f"scale by {known}"
     if found.units == "metres":
         how += f", the scale of the positions differs by {before.scale / scale - 1:+.1%}"

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.database.reading import PosePrior
+from colmap_av1.geometry.alignment import transform_poses
 from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
 from colmap_av1.geometry.undistortion import output_cameras
 from colmap_av1.images.image_set import ImageSet
@@ -65,9 +66,10 @@ def place_stage(
         images = placed.images
         if found.is_moved:
             poses = np.array([image.cam_from_world for image in images])
+            moved = transform_poses(found.similarity, poses)
             images = [
                 replace(image, cam_from_world=pose)
-                for image, pose in zip(images, found.similarity.apply_to_poses(poses), strict=True)
+                for image, pose in zip(images, moved, strict=True)
             ]
         (partial / file).parent.mkdir()
         write_posed_model(partial / file, PosedModel(placed.cameras, images))
