@@ -189,8 +189,10 @@ def mean_error(cloud: ModelPoints) -> float:
     return float(cloud.error[cloud.error >= 0].mean())
 
 
-def reprojection_errors(points: ModelPoints, views: Sequence[PosedCamera]) -> NDArray[np.float64]:
-    """Mean reprojection errors [num_points] in pixels of the images, with their distortion.
+def mean_reprojection_errors(
+    points: ModelPoints, views: Sequence[PosedCamera]
+) -> NDArray[np.float64]:
+    """Mean reprojection error of each point, in pixels of the images with their distortion.
 
     Args:
         points: the points.

@@ -19,8 +19,8 @@ from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.track_points import (
     Colours,
     mean_error,
+    mean_reprojection_errors,
     rays_of,
-    reprojection_errors,
     seen_in,
     to_model_points,
 )
@@ -82,7 +82,7 @@ def _tracked_points(
     tracked = to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
     # Triangulation measures errors in pixels of a pinhole camera, which are wrong for rays that a
     # fisheye lens receives from behind.
-    tracked = replace(tracked, error=reprojection_errors(tracked, views))
+    tracked = replace(tracked, error=mean_reprojection_errors(tracked, views))
     fit = tracked.error <= run.options.triangulate.max_reprojection_error
     return take_points(tracked, np.flatnonzero(fit)), agreeing
 
