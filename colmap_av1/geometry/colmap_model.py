@@ -113,7 +113,7 @@ def take_rows(
     Returns:
         int64 [n + 1] offsets of the selected rows, and int64 [m] the indices of their elements.
     """
-    lengths = np.diff(offsets)[rows]
+    lengths = offsets[rows + 1] - offsets[rows]
     taken = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
     return taken, np.arange(taken[-1]) + np.repeat(offsets[rows] - taken[:-1], lengths)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.geometry.colmap_model import take_rows
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.mapper_limits import (
     MIN_INLIERS,
@@ -43,8 +44,6 @@ class Growth:
         cameras: Sequence[pycolmap.Camera],
         known: Sequence[Sequence[_Floats | None]],
     ) -> None:
-        from scipy.sparse import csr_array  # noqa: PLC0415 - slow to import
-
         self._offsets = np.cumsum([0, *(len(own.xy) for own in matched.keypoints)])
         edges = [
             geometry.inlier_matches + self._offsets[pair]
@@ -67,10 +66,10 @@ class Growth:
                 rays /= np.linalg.norm(rays, axis=1, keepdims=True)
                 self._rays[self._offsets[i] : self._offsets[i + 1]] = rays
         self._num_tracks = 1 + int(self._track.max(initial=-1))
-        self._observed = csr_array(
-            (np.ones(len(views), np.int32), (self._track, views)),
-            shape=(self._num_tracks, len(cameras)),
-        )
+        # The views of each track, one track after the other.
+        order = np.argsort(self._track, kind="stable")
+        self._views = views[order]
+        self._bounds = np.searchsorted(self._track[order], np.arange(self._num_tracks + 1))
 
     def registered(self, pair: Sequence[int], max_images: int | None = None) -> NDArray[np.bool_]:
         """Which images the mapper registers.
@@ -97,14 +96,16 @@ class Growth:
     def _register(self, model: _GrowingModel, image: int) -> None:
         model.registered[image] = True
         own = slice(self._offsets[image], self._offsets[image + 1])
-        track, rays = self._track[own], self._rays[own]
-        is_first = np.isnan(model.first_ray[track, 0])
+        waiting = np.flatnonzero(~model.is_point[self._track[own]]) + own.start
+        track, rays = self._track[waiting], self._rays[waiting]
+        first_ray = model.first_ray[track]
+        cosine = np.einsum("ij,ij->i", first_ray, rays)
+        is_first = np.isnan(first_ray[:, 0])
         model.first_ray[track[is_first]] = rays[is_first]
-        cosine = (model.first_ray[track] * rays).sum(axis=1)
-        is_wide = cosine < np.cos(np.radians(POINT_MIN_ANGLE))
-        new = np.unique(track[is_wide & ~model.is_point[track]])
+        new = np.unique(track[cosine < np.cos(np.radians(POINT_MIN_ANGLE))])
         model.is_point[new] = True
-        model.num_visible += self._observed[new].sum(axis=0)
+        _, observed = take_rows(self._bounds, new)
+        model.num_visible += np.bincount(self._views[observed], minlength=len(model.registered))
 
 
 class _GrowingModel:
