@@ -19,6 +19,7 @@ from colmap_av1.util.remote import (
     is_url,
     open_to_read,
     unless_stalled,
+    with_slashes,
     without_secrets,
 )
 
@@ -126,6 +127,7 @@ def _check_name(video: Video) -> None:
 
 def _listed(word: str, output: str, stall: float) -> Iterable[tuple[str, str]]:
     """Names and addresses of the videos of one input."""
+    word = word if is_url(word) else with_slashes(word)
     place = _Url(word, stall) if is_url(word) else _Local(word)
     if place.is_folder():
         root = absolute(word).rstrip("/")
@@ -198,14 +200,15 @@ class _Local:
         return os.path.isfile(self._path)
 
     def matches(self) -> list[str]:
-        return sorted(p for p in glob.glob(self._path, recursive=True) if os.path.isfile(p))
+        found = (p for p in glob.glob(self._path, recursive=True) if os.path.isfile(p))
+        return sorted(map(with_slashes, found))
 
     def videos_below(self) -> Iterator[str]:
         for folder, folders, files in os.walk(os.path.abspath(self._path), onerror=_raise):
             folders[:] = sorted(name for name in folders if not name.startswith("."))
             for name in sorted(files):
                 if _is_video(name):
-                    yield os.path.join(folder, name)
+                    yield with_slashes(os.path.join(folder, name))
 
 
 class _Url:

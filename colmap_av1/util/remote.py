@@ -37,10 +37,15 @@ def is_url(address: str) -> bool:
 
 
 def absolute(address: str) -> str:
-    """The URL or absolute path of an address."""
+    """The URL or absolute path of an address, with "/" between its parts."""
     if address.startswith("file://"):
         address = address.removeprefix("file://")
-    return address if is_url(address) else os.path.abspath(address)
+    return address if is_url(address) else with_slashes(os.path.abspath(address))
+
+
+def with_slashes(path: str) -> str:
+    """A path of this machine with "/" between its parts, as Windows accepts, too."""
+    return path.replace(os.sep, "/")
 
 
 def filesystem(url: str) -> tuple[Any, str]:
