@@ -124,7 +124,7 @@ def widest_angles(
     offsets: NDArray[np.int64],
     view: NDArray[np.int64],
 ) -> NDArray[np.float64]: ...
-def hanging_observations(
+def floater_observations(
     *,
     cam_from_world: NDArray[np.float64],
     focal: NDArray[np.float64],
@@ -133,11 +133,11 @@ def hanging_observations(
     xyz: NDArray[np.float64],
     offsets: NDArray[np.int64],
     observation: NDArray[np.int64],
-    before: float,
-    as_near: float,
+    distance_share: float,
+    near_ratio: float,
     support: int,
-    around: float,
-    fewest_around: int,
+    square_width: float,
+    fewest_in_square: int,
 ) -> NDArray[np.int64]: ...
 def points_in_view(
     cam_from_world: NDArray[np.float64],

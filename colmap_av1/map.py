@@ -159,7 +159,7 @@ def map_database(
         checked.depth.warning,
         focal_length_warning(model.cameras.values()),
         # Seams of the model are more specific than gaps of the matches.
-        *(found.seam_warnings or (few_matches_warning(checked.thin_gaps),)),
+        *(found.seam_warnings or (few_matches_warning(checked.few_match_gaps),)),
         found.long_range.warning() if found.long_range else unreadable,
     )
     return MapReport(

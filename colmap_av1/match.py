@@ -539,7 +539,7 @@ def _match_jointly(
     """Match the images by the observations that agree with an estimate of all poses."""
     stages = scratch / ".stages"
     stages.mkdir()
-    # The images are already chosen.
+    # The images are already chosen, and their names need not suit trainers.
     chosen = replace(options, images=ImageOptions())
     run = Run(
         images.inputs,

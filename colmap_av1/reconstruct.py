@@ -85,8 +85,8 @@ class ReconstructReport:
         num_frames: number of shown frames of the videos.
         num_images: number of frames chosen as images, plus photos.
         masked: share of the images' pixels that masks exclude; None without masks.
-        moving: share of the images' pixels on dynamic objects, which get no points; None if these
-            were not looked for.
+        dynamic_share: share of the images' pixels on dynamic objects, which get no points; None if
+            these were not looked for.
         num_key_images: number of key images. COLMAP's mapper estimates their poses; the others are
             registered by resection.
         num_registered: number of registered images. Only these are written.
@@ -124,7 +124,7 @@ class ReconstructReport:
     num_frames: int
     num_images: int
     masked: float | None
-    moving: float | None
+    dynamic_share: float | None
     num_key_images: int
     num_registered: int
     registered: dict[str, int]
@@ -300,7 +300,7 @@ def _run_stages(run: Run) -> ReconstructReport:
         num_frames=sum(stage.result.num_frames for stage in tracked),
         num_images=len(image_set.sequence),
         masked=image_set.masked,
-        moving=posed.dynamic.result.moving if posed.dynamic is not None else None,
+        dynamic_share=posed.dynamic.result.share if posed.dynamic is not None else None,
         num_key_images=len(matches.key_images),
         num_registered=poses.num_registered,
         registered=poses.registered,

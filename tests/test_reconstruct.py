@@ -294,14 +294,14 @@ def contents(output: Path) -> dict[str, bytes]:
 def test_damaged_files_are_written_again(copy: Path) -> None:
     """The files are deleted, truncated, or overwritten by zeros."""
     before = contents(copy)
-    for name in (".stages/tracks.npz", ".stages/moving.npz", "images/frame_000006.jpg"):
+    for name in (".stages/tracks.npz", ".stages/dynamic.npz", "images/frame_000006.jpg"):
         (copy / name).unlink()
     for name in ("database.db", ".stages/placed.npz"):
         os.truncate(copy / name, (copy / name).stat().st_size - 1)
     for name in (".stages/poses/0.npz", "sparse/0/points3D.bin"):
         (copy / name).write_bytes(bytes((copy / name).stat().st_size))
     resumed = reconstruct(SCENE, copy, options=OPTIONS).resumed
-    assert not {"tracks", "matches", "poses", "resection", "moving", "model"} & set(resumed)
+    assert not {"tracks", "matches", "poses", "resection", "dynamic", "model"} & set(resumed)
     assert contents(copy) == before
 
 

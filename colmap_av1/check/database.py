@@ -64,7 +64,7 @@ class DatabaseCheck:
         num_connected_images: number of images in the largest group that used pairs connect.
         parallax: parallax of the widest pairs; None if no pair is used.
         depth: whether the pairs determine depth.
-        thin_gaps: gaps between images of a video with few matches across them.
+        few_match_gaps: gaps between images of a video with few matches across them.
         findings: the findings, most severe first.
     """
 
@@ -88,7 +88,7 @@ class DatabaseCheck:
     num_connected_images: int
     parallax: Parallax | None
     depth: DepthEvidence
-    thin_gaps: tuple[Gap, ...]
+    few_match_gaps: tuple[Gap, ...]
     findings: tuple[Finding, ...]
 
     @property
@@ -147,7 +147,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> DatabaseCheck:
         (int(cameras[c].width), int(cameras[c].height)) for c in images.camera_ids if c in cameras
     ]
     videos = videos_of(images.camera_ids, images.names)
-    thin = few_match_gaps(pairs.index[used], pairs.num_inliers[used], images.names, videos)
+    gaps = few_match_gaps(pairs.index[used], pairs.num_inliers[used], images.names, videos)
     findings = [
         *image_findings(images, cameras),
         *value_findings(images, pairs, cameras),
@@ -155,7 +155,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> DatabaseCheck:
         *keypoint_findings(images, pairs),
         *pair_findings(pairs, images),
         *motion_findings(pairs, parallax, depth, group, len(images.ids)),
-        *gap_findings(thin),
+        *gap_findings(gaps),
         *orphan_findings(connection, pairs),
     ]
     order = ("error", "warning", "note")
@@ -180,6 +180,6 @@ def _check(connection: sqlite3.Connection, path: Path) -> DatabaseCheck:
         num_connected_images=group,
         parallax=parallax,
         depth=depth,
-        thin_gaps=thin,
+        few_match_gaps=gaps,
         findings=tuple(sorted(findings, key=lambda finding: order.index(finding.severity))),
     )

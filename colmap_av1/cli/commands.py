@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -266,7 +266,10 @@ def _info(namespace: argparse.Namespace) -> None:
             from colmap_av1.matching.shutter.of_video import estimate_video_read_out
 
             read_out = estimate_video_read_out(namespace.video, options, report)
-    write_report_json(namespace, result)
+    if read_out is None or isinstance(read_out, str):  # a text says why it is not observable
+        write_report_json(namespace, result, read_out=read_out)
+    else:
+        write_report_json(namespace, result, read_out=asdict(read_out))
     print_summary([*reports.info_rows(result), *reports.read_out_rows(read_out)])
 
 

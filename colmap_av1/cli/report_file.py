@@ -18,8 +18,8 @@ from colmap_av1.util.files import whole_file
 from colmap_av1.util.plain import plain
 
 
-def write_report_json(namespace: argparse.Namespace, report: Any) -> None:
-    """Write the report of a command on videos, if requested."""
+def write_report_json(namespace: argparse.Namespace, report: Any, **others: Any) -> None:
+    """Write the report of a command on videos, and other values by name, if requested."""
     if namespace.report_json is None:
         return
     from colmap_av1.video.container import read_file
@@ -31,6 +31,7 @@ def write_report_json(namespace: argparse.Namespace, report: Any) -> None:
         "report": dataclasses.asdict(report),
         "video_seconds": sum(known) if len(known) == len(durations) else None,
         "cpu_seconds": cpu_seconds(),
+        **others,
     }
     _write(namespace.report_json, facts)
 

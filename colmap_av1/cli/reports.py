@@ -74,7 +74,7 @@ def _estimate_rows(estimate: JointEstimate, num_images: int) -> Rows:
     registered = " + ".join(map(str, estimate.num_registered))
     return [
         ("joint estimate", f"{registered} of {num_images} images registered"),
-        *_dynamic_row(estimate.moving),
+        *_dynamic_row(estimate.dynamic_share),
         *_long_range_rows(estimate.long_range, estimate.long_range_largest),
         _focal_length_row(estimate.focal_lengths),
     ]
@@ -118,7 +118,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
             "frames in the video",
         ),
         *_mask_row(report.masked),
-        *_dynamic_row(report.moving),
+        *_dynamic_row(report.dynamic_share),
         *((f"images of {name}", f"{n} registered") for name, n in report.registered.items()),
         *(
             (f"images of {model.output.name}", f"{model.num_registered} registered")
@@ -194,8 +194,8 @@ def _mask_row(masked: float | None) -> Rows:
     return [] if masked is None else [("masks", f"exclude {masked:.1%} of the pixels")]
 
 
-def _dynamic_row(moving: float | None) -> Rows:
-    return [] if moving is None else [("dynamic pixels", f"{moving:.1%}")]
+def _dynamic_row(share: float | None) -> Rows:
+    return [] if share is None else [("dynamic pixels", f"{share:.1%}")]
 
 
 def _link_rows(links: LinkReport) -> Rows:

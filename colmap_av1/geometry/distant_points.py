@@ -35,13 +35,13 @@ _FAR_EXTENTS = 10.0
 _ANY_FAR = 100.0
 # A point is a floater if, in most of its images, it is nearer than this share of the distance of
 # its surroundings, and fewer than _SUPPORT points there have the same distance within a factor.
-_BEFORE = 0.5
-_AS_NEAR = 1.3
+_FLOATER_DISTANCE = 0.5
+_NEAR_RATIO = 1.3
 _SUPPORT = 4
 # Width in pixels of the square around a point that is its surroundings, and the smallest number of
 # points in it for a decision.
-_AROUND = 48.0
-_FEWEST_AROUND = 8
+_SQUARE_WIDTH = 48.0
+_FEWEST_IN_SQUARE = 8
 # Lower bound on angles in radians, to avoid division by zero.
 _TINY = 1e-12
 
@@ -131,9 +131,6 @@ def splat_points(
 
     Returns:
         The points, in the order of the tracks.
-
-    Raises:
-        OptionError: an option is out of range.
     """
     anywhere = replace(
         options, points="survey", max_points=None, min_angle=0.0, max_depth_error=None
@@ -270,12 +267,12 @@ def _merged(one: _Points, two: _Points) -> _Points:
 
 def _is_floater(points: _Points, seen: _Seen) -> NDArray[np.bool_]:
     """Whether each point is a floater: nearly alone far in front of its surroundings."""
-    votes = _core.hanging_observations(
+    votes = _core.floater_observations(
         **seen.of_points(points),
-        before=_BEFORE,
-        as_near=_AS_NEAR,
+        distance_share=_FLOATER_DISTANCE,
+        near_ratio=_NEAR_RATIO,
         support=_SUPPORT,
-        around=_AROUND,
-        fewest_around=_FEWEST_AROUND,
+        square_width=_SQUARE_WIDTH,
+        fewest_in_square=_FEWEST_IN_SQUARE,
     )
     return np.asarray(votes > 0.5 * np.diff(points.offsets))

@@ -57,20 +57,20 @@ def frames_by_content(
             f"there are {len(images)} images, but the video has {len(frames)} frames: "
             "give the video that the images were extracted from"
         )
-    likeness = images @ frames.T
-    found = np.argmax(likeness, axis=1).astype(np.int32)
+    similarity = images @ frames.T
+    found = np.argmax(similarity, axis=1).astype(np.int32)
     if len(np.unique(found)) < len(found):
-        found = _ascending_assignment(likeness)
+        found = _ascending_assignment(similarity)
     for k, path in enumerate(files):
-        best = int(np.argmax(likeness[k]))
-        if likeness[k, best] < _MIN_CORRELATION:
+        best = int(np.argmax(similarity[k]))
+        if similarity[k, best] < _MIN_CORRELATION:
             raise ImageError(
                 f"{path}: shows no frame of the video (the most similar is frame {best}, with "
-                f"correlation {likeness[k, best]:.3f}): give unedited images of this video, or "
+                f"correlation {similarity[k, best]:.3f}): give unedited images of this video, or "
                 "list their frames in a --frame_list"
             )
-        if _is_clearly_less(likeness[k, found[k]], likeness[k, best]):
-            twins = [files[int(i)].name for i in np.flatnonzero(likeness.argmax(axis=1) == best)]
+        if _is_clearly_less(similarity[k, found[k]], similarity[k, best]):
+            twins = [files[int(i)].name for i in np.flatnonzero(similarity.argmax(axis=1) == best)]
             if len(twins) > 1:
                 raise ImageError(
                     f"{' and '.join(twins)} show the same frame, {best}: keep one of them"
@@ -79,7 +79,7 @@ def frames_by_content(
                 f"{path}: shows frame {best}, but the names of the images are not in the order of "
                 "their frames: rename them, or list their frames in a --frame_list"
             )
-        _check_rivals(path, int(found[k]), likeness[k], frames)
+        _check_rivals(path, int(found[k]), similarity[k], frames)
     return np.asarray(found, dtype=np.int32)
 
 
@@ -97,20 +97,20 @@ def check_content(
         ImageError: an image shows something else.
     """
     images = np.array([_thumbnail(read_image(path)) for path in files])
-    likeness = np.zeros((len(files), 2 * _REACH + 1))
+    similarity = np.zeros((len(files), 2 * _REACH + 1))
     for index, picture in pictures:
         near = [k for k, frame in enumerate(frames) if abs(index - frame) <= _REACH]
         if near:
             thumbnail = _thumbnail(picture)
             for k in near:
-                likeness[k, index - frames[k] + _REACH] = images[k] @ thumbnail
+                similarity[k, index - frames[k] + _REACH] = images[k] @ thumbnail
         if index >= frames[-1] + _REACH:
             break
-    for path, frame, alike in zip(files, frames, likeness, strict=True):
-        best = int(np.argmax(alike))
-        if alike[_REACH] >= _MIN_CORRELATION and not _is_clearly_less(alike[_REACH], alike[best]):
+    for path, frame, own in zip(files, frames, similarity, strict=True):
+        best = int(np.argmax(own))
+        if own[_REACH] >= _MIN_CORRELATION and not _is_clearly_less(own[_REACH], own[best]):
             continue
-        shows = f"frame {frame + best - _REACH}" if alike[best] >= _MIN_CORRELATION else "another"
+        shows = f"frame {frame + best - _REACH}" if own[best] >= _MIN_CORRELATION else "another"
         raise ImageError(
             f"{path}: should show frame {frame} of the video but shows {shows}: give unedited "
             "images of this video, or list their frames in a --frame_list"
@@ -140,33 +140,33 @@ def is_turned_back(path: Path, pictures: Iterable[tuple[int, _Image]], display: 
 
 
 def _check_rivals(
-    path: Path, frame: int, likeness: NDArray[np.float32], frames: NDArray[np.float32]
+    path: Path, frame: int, similarity: NDArray[np.float32], frames: NDArray[np.float32]
 ) -> None:
     """Reject an image that fits another frame as well, unless the camera stands still."""
-    rivals = ~_is_clearly_less(likeness, likeness[frame])
+    rivals = ~_is_clearly_less(similarity, similarity[frame])
     # Frames without motion between them are interchangeable.
     differs = 1 - frames @ frames[frame] > _SAME
     still = np.ones(len(frames), dtype=np.bool_)
     still[: frame + 1] = ~np.maximum.accumulate(differs[frame::-1])[::-1]
     still[frame:] = ~np.maximum.accumulate(differs[frame:])
-    rivals &= ~still & (likeness <= likeness[frame])
+    rivals &= ~still & (similarity <= similarity[frame])
     if rivals.any():
-        rival = int(np.argmax(np.where(rivals, likeness, -1)))
+        rival = int(np.argmax(np.where(rivals, similarity, -1)))
         raise ImageError(
             f"{path}: looks like frame {frame} and like frame {rival}: list the frames of the "
             "images in a --frame_list"
         )
 
 
-def _is_clearly_less(likeness: Any, than: Any) -> NDArray[np.bool_]:
+def _is_clearly_less(similarity: Any, than: Any) -> NDArray[np.bool_]:
     """Whether one similarity is clearly less than another."""
-    return np.asarray((1 - likeness) > _MARGIN * (1 - than) + _SAME / 2)
+    return np.asarray((1 - similarity) > _MARGIN * (1 - than) + _SAME / 2)
 
 
-def _ascending_assignment(likeness: NDArray[np.float32]) -> NDArray[np.int32]:
+def _ascending_assignment(similarity: NDArray[np.float32]) -> NDArray[np.int32]:
     """Strictly ascending columns, one for each row, with the largest sum."""
-    num_images, num_frames = likeness.shape
-    total = likeness[0].astype(np.float64)
+    num_images, num_frames = similarity.shape
+    total = similarity[0].astype(np.float64)
     best_before = np.empty((num_images, num_frames), dtype=np.int32)
     for k in range(1, num_images):
         # For each column, the largest sum of the first k rows that ends before it.
@@ -174,7 +174,7 @@ def _ascending_assignment(likeness: NDArray[np.float32]) -> NDArray[np.int32]:
         is_new = np.concatenate([[True], total[1:] > running[:-1]])
         where = np.maximum.accumulate(np.where(is_new, np.arange(num_frames), 0))
         best_before[k, 1:], best_before[k, 0] = where[:-1], 0
-        total = likeness[k] + np.concatenate([[-np.inf], running[:-1]])
+        total = similarity[k] + np.concatenate([[-np.inf], running[:-1]])
     frames = np.empty(num_images, dtype=np.int32)
     frames[-1] = np.argmax(total)
     for k in range(num_images - 1, 0, -1):

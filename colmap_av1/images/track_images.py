@@ -146,7 +146,7 @@ def choose_from_video(
         existing: names of existing images.
         folder: folder of the images; None: no picture is decoded.
         display: how images show the pictures; None: as players do.
-        context: its progress is called in the stage "looking".
+        context: its progress is called in the stage "recognising".
     """
     return choose_images(
         tracks,
@@ -165,7 +165,7 @@ def decode_all(
     display: Display | None,
     context: RunContext,
 ) -> Iterator[tuple[int, _Image]]:
-    """Decode all frames that have tracks, with progress in the stage "looking"."""
+    """Decode all frames that have tracks, with progress in the stage "recognising"."""
     pictures = decodable_frames(
         source.pictures,
         num_frames,
@@ -174,7 +174,7 @@ def decode_all(
         use="pictures are used",
     )
     for index, picture in pictures:
-        context.progress("looking", index + 1, num_frames)
+        context.progress("recognising", index + 1, num_frames)
         yield index, picture
 
 

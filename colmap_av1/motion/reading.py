@@ -24,7 +24,9 @@ from colmap_av1.video.container import check_process, open_stream
 
 # Limit in bytes of the block data that all threads together read ahead.
 _READ_AHEAD = 1 << 28
-_BYTES_PER_UNIT = 24  # 4 for its index and a share of the 60 of its block; 8 in most videos
+# Bytes per unit in the worst case: 4 for its index and a share of the 60 of its block. In most
+# videos, they are 8.
+_BYTES_PER_UNIT = 24
 _SMALL_AHEAD = 4  # number of frames
 
 

@@ -64,7 +64,7 @@ class Posed:
         adjustment: the adjusted poses; None if they are not adjusted.
         tracks: the tracks of all videos, cut at gaps that links replace.
         links: links as tracks.
-        moving: masks that exclude dynamic objects, by image name.
+        dynamic_masks: masks that exclude dynamic objects, by image name.
         has_picture_positions: whether tracks have positions in the pictures; false if they were
             corrected for a rolling shutter.
         long_range: the long-range check; None if it was not made.
@@ -79,7 +79,7 @@ class Posed:
     adjustment: Kept[AdjustedResult] | None
     tracks: Tracks
     links: Tracks
-    moving: dict[str, Mask]
+    dynamic_masks: dict[str, Mask]
     has_picture_positions: bool
     long_range: Kept[LongRangeResult] | None = None
     rival: Kept[AdjustedResult] | None = None
@@ -96,7 +96,7 @@ class Posed:
             "matches": self.matches,
             "poses": self.mapped,
             "resection": self.resection,
-            "moving": self.dynamic,
+            "dynamic": self.dynamic,
             "adjustment": self.adjustment,
             "long_range": self.long_range,
         }
@@ -228,7 +228,7 @@ def _larger_model(run: Run, mapped: _Mapped, size: int, image_set: ImageSet) -> 
 
 
 def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
-    """Split the model at weak seams, and adjust the largest part separately.
+    """Split the model at seams with few points, and adjust the largest part separately.
 
     If pictures far apart in time contradict the poses, it is split at doubtful seams, too. The
     separate adjustment may change the number of points at a seam, so the seams of the largest part
@@ -239,10 +239,10 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
         if posed.adjustment is None:
             break
         adjusted = posed.adjustment.result
-        seams: Sequence[tuple[str, str]] = adjusted.thin_seams
+        seams: Sequence[tuple[str, str]] = adjusted.few_point_seams
         if posed.long_range is not None and posed.long_range.result.apart:
             seams = adjusted.doubtful_seams
-        seams = sorted({*seams, *adjusted.turns})
+        seams = sorted({*seams, *adjusted.scale_lost_seams})
         if not seams:
             break
         parts = split_stage(
@@ -355,7 +355,7 @@ def _long_range_check(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongR
         run,
         posed.tracks,
         image_set,
-        posed.moving,
+        posed.dynamic_masks,
         posed.last,
         masked=posed.dynamic.digest if posed.dynamic is not None else None,
         linked=posed.matches.result.links.looked_again,
@@ -379,7 +379,7 @@ def _is_doubtful(posed: Posed) -> bool:
     if posed.adjustment is None:
         return False
     matches, adjusted = posed.matches.result, posed.adjustment.result
-    is_weak = adjusted.doubtful_seams or adjusted.turns or matches.assumes_focal_length
+    is_weak = adjusted.doubtful_seams or adjusted.scale_lost_seams or matches.assumes_focal_length
     return bool((matches.links.gaps or matches.links.fast) and is_weak)
 
 
@@ -409,17 +409,17 @@ def _adjusted(
     run: Run, posed: Posed, image_set: ImageSet, poses: Kept[PosesResult], *, number: int = 1
 ) -> Kept[AdjustedResult]:
     """Adjust poses, see `adjustment_stage`."""
-    moving, has_picture_positions = posed.moving, posed.has_picture_positions
-    follows = has_picture_positions and (bool(moving) or has_changing_masks(image_set))
+    dynamic_masks, has_picture_positions = posed.dynamic_masks, posed.has_picture_positions
+    follows = has_picture_positions and (bool(dynamic_masks) or has_changing_masks(image_set))
     return adjustment_stage(
         run,
         posed.tracks,
         posed.links,
         image_set,
         poses,
-        moved=posed.dynamic.digest if posed.dynamic is not None and moving else None,
-        follow=partial(follow_behind, run, moving) if follows else None,
-        corners=partial(corners_in_images, run, moving) if has_picture_positions else None,
+        moved=posed.dynamic.digest if posed.dynamic is not None and dynamic_masks else None,
+        follow=partial(follow_behind, run, dynamic_masks) if follows else None,
+        corners=partial(corners_in_images, run, dynamic_masks) if has_picture_positions else None,
         is_fast=bool(posed.matches.result.links.fast),
         number=number,
     )
@@ -451,11 +451,13 @@ def refined_poses(
     poses: Kept[PosesResult] = mapped
     if len(keyed.sequence) < len(image_set.sequence):
         poses = resection = resection_stage(run, tracks, image_set, keyed, mapped)
-    moving: dict[str, Mask] = {}
+    dynamic_masks: dict[str, Mask] = {}
     if run.options.moving != "keep":
         dynamic = dynamic_stage(run, tracks, image_set, poses)
-        moving = read_dynamic_masks(run.stages)
-    tracks, links = (without_dynamic_tracks(own, image_set, moving, run) for own in (tracks, links))
+        dynamic_masks = read_dynamic_masks(run.stages)
+    tracks, links = (
+        without_dynamic_tracks(own, image_set, dynamic_masks, run) for own in (tracks, links)
+    )
     posed = Posed(
         matches=matched,
         mapped=mapped,
@@ -464,7 +466,7 @@ def refined_poses(
         adjustment=None,
         tracks=tracks,
         links=links,
-        moving=moving,
+        dynamic_masks=dynamic_masks,
         has_picture_positions=has_picture_positions,
     )
     if not run.options.mapping.adjust:

@@ -27,6 +27,7 @@ from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, reproj
 from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.image_matches import PairedImages, verify_images
+from colmap_av1.matching.mapper_limits import POINT_MIN_ANGLE
 from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
@@ -50,9 +51,11 @@ from colmap_av1.video.coded_size import smaller_grey
 # An observation of the adjusted model is an outlier if its error exceeds both this many pixels and
 # this multiple of the median error, which is larger with a rolling shutter, for example.
 _LEAST_ERROR, _MEDIAN_ERRORS = 0.6, 4.0
-# Points of motion tracks need the mapper's smallest triangulation angle, which is the default here,
-# and a depth error below 50 %.
-_POINTS = TriangulateOptions(max_reprojection_error=1.0, max_depth_error=0.5, points="survey")
+# Points of motion tracks need the mapper's smallest triangulation angle, and a depth error below
+# 50 %.
+_POINTS = TriangulateOptions(
+    max_reprojection_error=1.0, min_angle=POINT_MIN_ANGLE, max_depth_error=0.5, points="survey"
+)
 # The longest motion tracks, up to 150 per image, keep all observations.
 _WHOLE = DensityOptions(
     preset="sparse", max_tracks_per_image=150, spacing=8.0, min_images=3, max_sigma=0.0
@@ -95,14 +98,14 @@ class JointEstimate:
         long_range: median long-range epipolar error in pixels, over pairs of images ten or more
             apart; None if no such images have enough matches.
         long_range_largest: its 90th percentile.
-        moving: share of dynamic pixels, which have no matches.
+        dynamic_share: share of dynamic pixels, which have no matches.
         focal_lengths: the shortest and the longest focal length of the registered images in pixels.
     """
 
     num_registered: tuple[int, ...]
     long_range: float | None
     long_range_largest: float | None
-    moving: float | None
+    dynamic_share: float | None
     focal_lengths: tuple[float, float]
 
 
@@ -188,7 +191,7 @@ def match_jointly(
             num_registered=tuple(len(model.placed.images) for model in models),
             long_range=far.median if far is not None else None,
             long_range_largest=far.largest if far is not None else None,
-            moving=posed.dynamic.result.moving if posed.dynamic is not None else None,
+            dynamic_share=posed.dynamic.result.share if posed.dynamic is not None else None,
             focal_lengths=(min(focal), max(focal)),
         ),
         poses=[model.poses_of(image_set) for model in models],

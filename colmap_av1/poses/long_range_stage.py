@@ -51,7 +51,7 @@ def long_range_stage(
     run: Run,
     tracks: Tracks,
     image_set: ImageSet,
-    moving: Mapping[str, Mask],
+    dynamic_masks: Mapping[str, Mask],
     posed: Kept[PosesResult],
     *,
     masked: str | None,
@@ -63,7 +63,7 @@ def long_range_stage(
         run: inputs and options of the run.
         tracks: the tracks of all sequences.
         image_set: the images.
-        moving: masks that exclude dynamic pixels, by image name.
+        dynamic_masks: masks that exclude dynamic pixels, by image name.
         posed: the stage that estimated the poses.
         masked: digest of the stage that made the masks; None without one.
         linked: whether loop closures have been searched.
@@ -71,7 +71,7 @@ def long_range_stage(
 
     def make(_: Path) -> LongRangeResult:
         placed = read_posed_images(run, posed, image_set)
-        far = _compared(run, tracks, image_set, moving, placed)
+        far = _compared(run, tracks, image_set, dynamic_masks, placed)
         return LongRangeResult(
             median=far.median,
             largest=far.largest,
@@ -91,12 +91,16 @@ def long_range_stage(
 
 
 def _compared(
-    run: Run, tracks: Tracks, image_set: ImageSet, moving: Mapping[str, Mask], placed: PosedImages
+    run: Run,
+    tracks: Tracks,
+    image_set: ImageSet,
+    dynamic_masks: Mapping[str, Mask],
+    placed: PosedImages,
 ) -> LongRangeErrors:
     with run.clock.measure("long range"):
         points_of = _points_by_image(run, tracks, placed)
         check = LongRangeCheck(placed.images, placed.cameras, points_of.__getitem__)
-        masks = placed.masks_with(moving)
+        masks = placed.masks_with(dynamic_masks)
         places = np.searchsorted(image_set.images.frames, placed.frames[check.wanted]).tolist()
         index_of = dict(zip(places, check.wanted, strict=True))
         for done, (place, picture) in enumerate(run.pictures(image_set)(places), start=1):

@@ -106,16 +106,16 @@ class AdjustedResult(PosesResult):
         num_motion_points: number of points of motion tracks. They come first; points of corners
             and links follow.
         doubtful_seams: names of the images before and after each of `Seams.doubtful`.
-        thin_seams: names of the images before and after each of `Seams.thin`.
-        turns: names of the images before and after each of `Seams.turns`.
+        few_point_seams: names of the images before and after each of `Seams.few_points`.
+        scale_lost_seams: names of the images before and after each of `Seams.worst_scale_lost`.
         usual_scaled: see `Seams.usual_scaled`.
-        seams_warning: see `Seams.weak_warning`.
+        seams_warning: see `Seams.disconnected_warning`.
     """
 
     num_motion_points: int
     doubtful_seams: tuple[tuple[str, str], ...]
-    thin_seams: tuple[tuple[str, str], ...]
-    turns: tuple[tuple[str, str], ...]
+    few_point_seams: tuple[tuple[str, str], ...]
+    scale_lost_seams: tuple[tuple[str, str], ...]
     usual_scaled: float
     seams_warning: str | None
 
@@ -438,11 +438,11 @@ def adjustment_stage(
             registered=registered_by_video(result.by_name, image_set),
             num_motion_points=int(is_motion.sum()),
             doubtful_seams=tuple(seams.pairs[i] for i in seams.doubtful),
-            thin_seams=tuple(seams.pairs[i] for i in seams.thin),
-            turns=tuple(seams.pairs[i] for i in seams.turns),
+            few_point_seams=tuple(seams.pairs[i] for i in seams.few_points),
+            scale_lost_seams=tuple(seams.pairs[i] for i in seams.worst_scale_lost),
             usual_scaled=seams.usual_scaled,
             # No warning about a lost scale: the model is split there, see `parts`.
-            seams_warning=seams.weak_warning,
+            seams_warning=seams.disconnected_warning,
         )
 
     settings = (

@@ -55,7 +55,7 @@ _LEAST_REGISTERED = 0.5
 # 0.01 to 0.9 of the first on 17 of them; on the other it rose from 0.2 to 0.3 % of the extent. On
 # one walk the ratio was 1.007, and the error rose from 0.6 to 9.6 %.
 _MAX_COST_RATIO = 1.002
-# Above this ratio, the observations do not tell which of the two is right.
+# Above this ratio, the observations do not show which of the two is right.
 _CLEAR_RATIO = 0.99
 
 

@@ -19,17 +19,18 @@ from colmap_av1.images.names import natural_order, videos_of
 
 # Points with fewer views are ignored: two views do not constrain the scale between images.
 _FEWEST_VIEWS = 3
-# A seam is doubtful, or weak, if it has less than this share of the median number of points. At
-# jerks, links bring correct models to 15 % or more; models that were bent had 1 to 5 %.
+# A seam is doubtful, or has few points, if it has less than this share of the median number of
+# points. At jerks, links bring correct models to 15 % or more; models that were bent had 1 to 5 %.
 _DOUBTFUL = 0.15
-_WEAK = 0.07
+_FEW = 0.07
 # A point connects two images that are at most this many images apart. Otherwise a place that is
 # seen again would connect all seams in between.
 _REACH = 10
-# A seam with this many points is never weak, however many others have: bent models had at most 50.
+# This many points are never few, however many other seams have: bent models had at most 50.
 _ENOUGH = 100
-# A seam is not weak if images before and after it share at least this share of the median number
-# of points, however far apart they are: the parts of a cut video may see the same place elsewhere.
+# A seam with few points is not disconnected if images before and after it share at least this share
+# of the median number of points, however far apart they are: the parts of a cut video may see the
+# same place elsewhere.
 _ELSEWHERE = 0.5
 # A point has depth if its parallax exceeds this many pixels, several times the error of an
 # observation.
@@ -48,7 +49,12 @@ _DEEP = 100
 class Seams:
     """The points at each seam: between neighbours in time of the same camera and folder.
 
-    Only points with at least three views count.
+    Only points with at least three views count. A model may be bent at seams of these kinds:
+
+    - `doubtful`: much fewer points than usual connect the sides;
+    - `few_points`: even fewer, a part of these;
+    - `disconnected`: a part of `few_points` whose sides share no points elsewhere either;
+    - `scale_lost`: points connect the sides, but hardly any has depth on both.
 
     Attributes:
         pairs: names of the images before and after each seam, in natural order.
@@ -68,16 +74,16 @@ class Seams:
     num_deep: NDArray[np.int64]
 
     @property
-    def weak(self) -> list[int]:
-        """Indices of seams with far fewer points than the others: a model may be bent there."""
+    def disconnected(self) -> list[int]:
+        """Indices of seams with few points whose sides share few points elsewhere either."""
         if len(self.num_points) == 0:
             return []
         enough = _ELSEWHERE * float(np.median(self.num_points))
-        return [i for i in self.thin if self.num_elsewhere[i] < enough]
+        return [i for i in self.few_points if self.num_elsewhere[i] < enough]
 
     @property
     def doubtful(self) -> list[int]:
-        """Indices of seams with much fewer points than the others, including the weak ones."""
+        """Indices of seams with much fewer points than the others."""
         return self._below(_DOUBTFUL)
 
     @property
@@ -87,21 +93,21 @@ class Seams:
         return float(np.quantile(self.num_scaled, 0.9)) if len(self.num_scaled) else 0.0
 
     @property
-    def unscaled(self) -> list[int]:
+    def scale_lost(self) -> list[int]:
         """Indices of seams across which too few points carry the scale of the model."""
         least = min(_LOST * self.usual_scaled, _SCALED)
         return [int(i) for i in np.flatnonzero((self.num_scaled < least) & (self.num_deep > _DEEP))]
 
     @property
-    def thin(self) -> list[int]:
+    def few_points(self) -> list[int]:
         """Indices of seams that few points connect, even if both sides share points elsewhere."""
-        return self._below(_WEAK, most=_ENOUGH)
+        return self._below(_FEW, most=_ENOUGH)
 
     @property
-    def turns(self) -> list[int]:
-        """Index of the weakest seam in every run of consecutive seams that lose the scale."""
+    def worst_scale_lost(self) -> list[int]:
+        """Index of the worst seam in every run of consecutive seams that lose the scale."""
         runs: list[list[int]] = []
-        for seam in self.unscaled:
+        for seam in self.scale_lost:
             if runs and runs[-1][-1] == seam - 1:
                 runs[-1].append(seam)
             else:
@@ -119,17 +125,17 @@ class Seams:
 
     @property
     def warning(self) -> str | None:
-        """Warning about weak seams, or else about seams that lose the scale."""
-        return self.weak_warning or self._scale_warning
+        """Warning about disconnected seams, or else about seams that lose the scale."""
+        return self.disconnected_warning or self._scale_warning
 
     @property
-    def weak_warning(self) -> str | None:
-        """Warning about weak seams."""
-        if not self.weak:
+    def disconnected_warning(self) -> str | None:
+        """Warning about disconnected seams."""
+        if not self.disconnected:
             return None
-        where = min(self.weak, key=lambda i: (int(self.num_points[i]), i))
+        where = min(self.disconnected, key=lambda i: (int(self.num_points[i]), i))
         (first, second), count = self.pairs[where], int(self.num_points[where])
-        more = len(self.weak) - 1
+        more = len(self.disconnected) - 1
         others = f", and few at {more} more {'place' if more == 1 else 'places'}" if more else ""
         usual = int(np.median(self.num_points))
         return (
@@ -141,12 +147,12 @@ class Seams:
     @property
     def _scale_warning(self) -> str | None:
         """Warning about seams that lose the scale."""
-        if not self.unscaled:
+        if not self.scale_lost:
             return None
-        first = last = self.unscaled[0]
-        while last + 1 in self.unscaled:
+        first = last = self.scale_lost[0]
+        while last + 1 in self.scale_lost:
             last += 1
-        more = self.unscaled[-1] > last
+        more = self.scale_lost[-1] > last
         return (
             f"no points carry the scale from '{self.pairs[first][0]}' to '{self.pairs[last][1]}'"
             f"{', and elsewhere' if more else ''}: the camera turns there without moving sideways, "

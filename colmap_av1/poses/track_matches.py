@@ -1,4 +1,4 @@
-"""Verified matches of images that share tracks, however far apart they are."""
+"""Tracks of models, and pairs of images that share tracks, however far apart they are."""
 
 from __future__ import annotations
 

@@ -259,7 +259,7 @@ def model_stage(
     run: Run,
     tracks: Tracks,
     image_set: ImageSet,
-    moving: Mapping[str, Mask],
+    dynamic_masks: Mapping[str, Mask],
     posed: Kept[PosesResult],
 ) -> Kept[ModelResult]:
     """Triangulate all tracks, and write the undistorted images and the model.
@@ -268,7 +268,7 @@ def model_stage(
         run: inputs and options of the run.
         tracks: the tracks of all sequences, without those on dynamic objects.
         image_set: all images.
-        moving: masks that exclude dynamic pixels, by image name.
+        dynamic_masks: masks that exclude dynamic pixels, by image name.
         posed: the stage that estimated the poses.
     """
     options, clock = run.options, run.clock
@@ -279,13 +279,13 @@ def model_stage(
         cameras = output_cameras(placed.cameras, undistort=options.undistort)
         images = placed.images
         given = undistorted_masks(placed.masks, placed.camera_of_image, cameras)
-        joined = placed.masks_with(moving)
+        joined = placed.masks_with(dynamic_masks)
         counting = undistorted_masks(joined, placed.camera_of_image, cameras)
         views = views_of(images, cameras, counting)
         with clock.measure("points"):
             tracked, agreeing = _tracked_points(run, placed, views, tracks)
-            shows_moving = np.array([image.name in moving for image in images])
-            tracked = take_points(tracked, static_points(tracked, shows_moving))
+            shows_dynamic = np.array([image.name in dynamic_masks for image in images])
+            tracked = take_points(tracked, static_points(tracked, shows_dynamic))
         undistort = _undistortions(placed, cameras)
         cloud = _written_cloud(run, partial / "images", placed, views, tracked, undistort=undistort)
         check_unchanged(*run.files)

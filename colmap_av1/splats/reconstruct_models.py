@@ -60,7 +60,7 @@ def written_model(
     assert run.positions is not None
     placed = place_stage(run, image_set, posed.last, run.positions)
     tracks = Tracks.concatenate(posed.tracks, posed.links)
-    return placed, model_stage(run, tracks, image_set, posed.moving, placed)
+    return placed, model_stage(run, tracks, image_set, posed.dynamic_masks, placed)
 
 
 def further_models(

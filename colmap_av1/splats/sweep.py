@@ -57,8 +57,8 @@ _MOST_ERROR = 0.25
 # by at most this factor.
 _AROUND = 1.6 * CELL
 _SAME_DEPTH = 1.15
-# A point is a floater if more than a share of this many images before and after it show, in the
-# same place, a surface that is farther by this factor.
+# A point is a floater if more than the share _MAY_HIDE of this many images before and after it
+# show, in the same place, a surface that is farther by the factor _HIDES.
 _HIDES_IN = 8
 _HIDES = 1.25
 _MAY_HIDE = 0.25

@@ -172,8 +172,8 @@ def _follow(
     found, forward = search(before, now, at, at + motion, _LEVELS)
     # The backward search starts at the original position: it only checks that the corner stays.
     back, backward = search(now, before, found, at, 0)
-    missed = np.abs(back - at).max(axis=1)
-    return found, forward & backward & (missed <= _MAX_RETURN)
+    error = np.abs(back - at).max(axis=1)
+    return found, forward & backward & (error <= _MAX_RETURN)
 
 
 def _are_used(counts: Counts, frame: int, size: tuple[int, int], at: _Floats) -> NDArray[np.bool_]:

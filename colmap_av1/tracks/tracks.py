@@ -30,11 +30,11 @@ class Tracks:
     Track t has the observations offsets[t] : offsets[t + 1], sorted by frame.
 
     Attributes:
-        num_frames: number of shown frames of the video.
-        width: picture width in pixels, after super-resolution.
-        height: picture height in pixels.
+        num_frames: number of frames of the video, or of all videos if tracks are joined.
+        width: width in pixels of the pictures that positions refer to.
+        height: their height.
         offsets: int64 [num_tracks + 1].
-        frame: int32 [num_observations] display index of the observing frame.
+        frame: int32 [num_observations] the observing frame, in the order of display.
         xy: float32 [num_observations, 2] position in pixels, (x right, y down), origin at
             the top-left corner of the image: the first pixel's centre is (0.5, 0.5).
         sigma: float32 [num_observations] expected standard deviation of the position along

@@ -58,7 +58,7 @@ class _Encoder:
 
 
 def _nvenc(quality: int, speed: int) -> list[str]:
-    # These are the flags of the published method.
+    # These are the flags of the published method, see CITATION.cff.
     rate = ["-rc", "constqp", "-qp", str(_q_index(quality))]
     return ["-tune", "hq", "-preset", f"p{speed}", *rate, "-b_ref_mode", "0", "-bf", "0"]
 

@@ -54,7 +54,7 @@ def test_no_picture_is_decoded_without_an_image_folder(clip: Path) -> None:
         next_to=NEXT_TO,
         context=RunContext(clock, lambda stage, done, total: stages.add(stage)),
     )
-    assert "looking" not in stages
+    assert "recognising" not in stages
     assert "decoding" not in clock.seconds
     assert found.tracked.chosen.names == image_names("frame_%06d.png", found.tracked.chosen.frames)
     assert found.size == (192, 128)

@@ -279,7 +279,7 @@ def test_reconstruct_masks_dynamic_pixels(
     assert np.mean(found[there]) > 0.8
     assert on_it < 0.002 * total
     assert np.mean(found[~there]) < 0.08
-    assert report.moving == pytest.approx(found.mean(), rel=0.05)
+    assert report.dynamic_share == pytest.approx(found.mean(), rel=0.05)
     errors = pose_errors(model_poses(model, NUM_FRAMES), truth.cam_from_world[:NUM_FRAMES])
     assert errors is not None
     assert errors.ate < 0.0002 * errors.extent

@@ -26,7 +26,7 @@ _SOUND = 0.95
 def test_consistent_model_has_no_weak_seam(made: ReconstructReport) -> None:
     seams = model_seams(read_model(made.output / "sparse" / "0"))
     assert len(seams.pairs) == made.num_registered - 1
-    assert seams.weak == []
+    assert seams.disconnected == []
     assert seams.warning is None
 
 
@@ -47,8 +47,8 @@ def test_seam_with_few_points_is_reported(
 
     seams = model_seams(model)
     first, second = by_name[middle - 1].name, by_name[middle].name
-    assert [seams.pairs[i] for i in seams.weak] == [(first, second)]
-    assert seams.num_points[seams.weak].tolist() == [_LEFT]
+    assert [seams.pairs[i] for i in seams.disconnected] == [(first, second)]
+    assert seams.num_points[seams.disconnected].tolist() == [_LEFT]
 
     model.write(tmp_path)
     words = ["--model", str(tmp_path), "--image_path", str(made.output / "images")]
@@ -68,15 +68,15 @@ def test_loop_closures_do_not_count_at_seams_inside_the_loop(tmp_path: Path) -> 
 def test_cut_is_no_weak_seam_if_a_loop_closure_joins_its_sides(tmp_path: Path) -> None:
     views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
     write_row(tmp_path, views, 20)
-    assert model_seams(read_model(tmp_path)).weak == [14]
+    assert model_seams(read_model(tmp_path)).disconnected == [14]
     write_row(tmp_path, views, 150)
-    assert model_seams(read_model(tmp_path)).weak == []
+    assert model_seams(read_model(tmp_path)).disconnected == []
 
 
 def test_seams_are_found_with_a_camera_per_image(tmp_path: Path) -> None:
     views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
     write_row(tmp_path, views, 0, num_cameras=30)
-    assert model_seams(read_model(tmp_path)).weak == [14]
+    assert model_seams(read_model(tmp_path)).disconnected == [14]
 
 
 def test_photos_are_no_neighbours_in_time(tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_photos_are_no_neighbours_in_time(tmp_path: Path) -> None:
     write_row(tmp_path, views, 0)
     model = read_model(tmp_path)
     names = sorted(image.name for image in model.images.values())
-    assert model_seams(model, names[15:]).weak == []
+    assert model_seams(model, names[15:]).disconnected == []
     assert len(model_seams(model, names[15:]).num_points) == 14
 
 
@@ -210,15 +210,15 @@ def test_turn_keeps_the_scale_if_points_are_seen_across_it(
 ) -> None:
     _walk_with_a_turn(tmp_path, degrees, aside, rest)
     seams = model_seams(read_model(tmp_path))
-    assert seams.unscaled == []
+    assert seams.scale_lost == []
     assert seams.warning is None
 
 
 def test_turn_wider_than_the_field_of_view_loses_the_scale(tmp_path: Path) -> None:
     turn = _walk_with_a_turn(tmp_path, degrees=80)
     seams = model_seams(read_model(tmp_path))
-    assert seams.weak == []
-    lost = {seams.pairs[i] for i in seams.unscaled}
+    assert seams.disconnected == []
+    lost = {seams.pairs[i] for i in seams.scale_lost}
     assert len(lost) > len(turn) / 2
     assert lost <= set(pairwise(turn))
     assert seams.warning is not None
@@ -237,11 +237,11 @@ def test_enough_points_carry_the_scale_even_if_others_have_more(
     pairs = tuple((f"{k}.png", f"{k + 1}.png") for k in range(20))
     many = np.full(20, 2000)
     seams = Seams(pairs, num_points=many, num_elsewhere=many, num_scaled=scaled, num_deep=many)
-    assert seams.unscaled == ([10] if is_lost else [])
+    assert seams.scale_lost == ([10] if is_lost else [])
 
 
 def test_loop_closure_carries_no_scale_across_a_turn_inside_the_loop(tmp_path: Path) -> None:
     turn = _walk_with_a_turn(tmp_path, degrees=80, back=True)
     seams = model_seams(read_model(tmp_path))
-    lost = {seams.pairs[i] for i in seams.unscaled} & set(pairwise(turn))
+    lost = {seams.pairs[i] for i in seams.scale_lost} & set(pairwise(turn))
     assert len(lost) > len(turn) / 2

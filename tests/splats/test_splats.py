@@ -273,7 +273,13 @@ def given_to_core(num_points: int) -> dict[str, np.ndarray]:
     }
 
 
-HANGING = {"before": 0.7, "as_near": 1.1, "support": 2, "around": 1000.0, "fewest_around": 3}
+FLOATERS = {
+    "distance_share": 0.7,
+    "near_ratio": 1.1,
+    "support": 2,
+    "square_width": 1000.0,
+    "fewest_in_square": 3,
+}
 
 
 @pytest.mark.parametrize(
@@ -294,12 +300,12 @@ HANGING = {"before": 0.7, "as_near": 1.1, "support": 2, "around": 1000.0, "fewes
 def test_core_refuses_mismatched_arrays_of_points(name: str, wrong: Callable[..., object]) -> None:
     given = given_to_core(5)
     assert np.abs(_core.reprojection_errors(**given)).max() < 1e-9
-    assert _core.hanging_observations(**given, **HANGING).tolist() == [0] * 5
+    assert _core.floater_observations(**given, **FLOATERS).tolist() == [0] * 5
     given[name] = wrong(given[name])
     with pytest.raises(ValueError, match=r"fit|no such"):
         _core.reprojection_errors(**given)
     with pytest.raises(ValueError, match=r"fit|no such"):
-        _core.hanging_observations(**given, **HANGING)
+        _core.floater_observations(**given, **FLOATERS)
     if name in ("view", "offsets", "xyz", "cam_from_world"):
         centres = camera_centres(given["cam_from_world"])
         rest = {key: given[key] for key in ("xyz", "offsets", "view")}
@@ -311,11 +317,11 @@ def test_core_ignores_nan() -> None:
     given = given_to_core(5)
     given["xyz"][0] *= 0.3  # floats in front of the others
     given["rays"] += 1.0  # all in one grid cell
-    counts = _core.hanging_observations(**given, **HANGING)
+    counts = _core.floater_observations(**given, **FLOATERS)
     assert counts.tolist() == [NUM_VIEWS, 0, 0, 0, 0]
     given["rays"][0] = np.nan
     given["xyz"][4] = np.nan
-    counts = _core.hanging_observations(**given, **HANGING)
+    counts = _core.floater_observations(**given, **FLOATERS)
     assert counts.tolist() == [NUM_VIEWS - 1, 0, 0, 0, 0]
     errors = _core.reprojection_errors(**given)
     assert np.isinf(errors[0])
@@ -326,7 +332,7 @@ def test_core_ignores_nan() -> None:
     assert (angles[:4] > 0).all()
     assert angles[4] == 0
     with pytest.raises(ValueError, match="wider than 0"):
-        _core.hanging_observations(**given, **HANGING | {"around": 0.0})
+        _core.floater_observations(**given, **FLOATERS | {"square_width": 0.0})
 
 
 def test_core_refuses_mismatched_arrays_of_surfaces() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -175,9 +176,9 @@ def test_match_command_reports_the_rolling_shutter(
 
 
 def test_info_command_reports_the_read_out_time(
-    clip: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["info", "--video", str(clip), "--quiet"]
+    words = ["info", "--video", str(clip), "--quiet", "--report_json", str(tmp_path / "a.json")]
     assert main(words) == 0
     without = capsys.readouterr().out
     assert "rolling shutter" not in without
@@ -200,6 +201,8 @@ def test_info_command_reports_the_read_out_time(
     assert main(words) == 0
     row = capsys.readouterr().out.splitlines()[-1]
     assert row.startswith(f"rolling shutter\t{found.milliseconds:.1f} +- {found.error:.1f} ms")
+    written = json.loads((tmp_path / "a.json").read_text())["read_out"]
+    assert written == {"milliseconds": found.milliseconds, "error": found.error}
 
 
 def test_poses_are_unchanged_if_no_read_out_time_is_found(ffmpeg: Ffmpeg, tmp_path: Path) -> None:

@@ -114,12 +114,13 @@ nb::tuple find_patches(const InputArray<std::uint8_t, nb::ndim<3>>& patches, con
                                     .change = span_of(change)},
                                    grey_picture(target), span_of(start), max_move);
   }
-  const std::size_t count = found.missed.size();
+  const std::size_t count = found.forward_backward_error.size();
   return nb::make_tuple(adopt<float>(std::move(found.xy), {count, 2}),
-                        adopt(std::move(found.missed)), adopt(std::move(found.likeness)));
+                        adopt(std::move(found.forward_backward_error)),
+                        adopt(std::move(found.correlation)));
 }
 
-geometry::SeenPoints seen_points(const Poses& cam_from_world, const Pairs& focal,
+geometry::ObservedPoints observed_points(const Poses& cam_from_world, const Pairs& focal,
                                  const Indices& view, const Pairs& rays, const Points& xyz,
                                  const Indices& offsets, const Indices& observation) {
   return {.cam_from_world = span_of(cam_from_world),
@@ -138,7 +139,7 @@ nb::object reprojection_errors(const Poses& cam_from_world, const Pairs& focal, 
   {
     const nb::gil_scoped_release release;
     errors = geometry::reprojection_errors(
-        seen_points(cam_from_world, focal, view, rays, xyz, offsets, observation));
+        observed_points(cam_from_world, focal, view, rays, xyz, offsets, observation));
   }
   return adopt(std::move(errors));
 }
@@ -154,21 +155,21 @@ nb::object widest_angles(const Points& centres, const Points& xyz, const Indices
   return adopt(std::move(angles));
 }
 
-nb::object hanging_observations(const Poses& cam_from_world, const Pairs& focal,
+nb::object floater_observations(const Poses& cam_from_world, const Pairs& focal,
                                 const Indices& view, const Pairs& rays, const Points& xyz,
-                                const Indices& offsets, const Indices& observation, double before,
-                                double as_near, std::int64_t support, double around,
-                                std::int64_t fewest_around) {
+                                const Indices& offsets, const Indices& observation,
+                                double distance_share, double near_ratio, std::int64_t support,
+                                double square_width, std::int64_t fewest_in_square) {
   std::vector<std::int64_t> counts;
   {
     const nb::gil_scoped_release release;
-    counts = geometry::hanging_observations(
-        seen_points(cam_from_world, focal, view, rays, xyz, offsets, observation),
-        {.before = before,
-         .as_near = as_near,
+    counts = geometry::floater_observations(
+        observed_points(cam_from_world, focal, view, rays, xyz, offsets, observation),
+        {.distance_share = distance_share,
+         .near_ratio = near_ratio,
          .support = support,
-         .around = around,
-         .fewest_around = fewest_around});
+         .square_width = square_width,
+         .fewest_in_square = fewest_in_square});
   }
   return adopt(std::move(counts));
 }
@@ -253,15 +254,15 @@ void bind_geometry(nb::module_& m) {
   m.def("find_patches", &find_patches, "patches"_a, "index"_a, nb::kw_only(), "middle"_a,
         "change"_a, "target"_a, "start"_a, "max_move"_a,
         "Search a grey picture for patches [p, side, side] that another view deforms: (xy [n, 2], "
-        "forward-backward error in pixels [n], inf if not found, likeness [n]).");
+        "forward-backward error in pixels [n], inf if not found, correlation [n]).");
   m.def("reprojection_errors", &reprojection_errors, nb::kw_only(), "cam_from_world"_a, "focal"_a,
         "view"_a, "rays"_a, "xyz"_a, "offsets"_a, "observation"_a,
         "Reprojection error in pixels of each observation of points, inf behind the camera.");
   m.def("widest_angles", &widest_angles, nb::kw_only(), "centres"_a, "xyz"_a, "offsets"_a, "view"_a,
         "Largest triangulation angle of each point in radians, slightly too small at worst.");
-  m.def("hanging_observations", &hanging_observations, nb::kw_only(), "cam_from_world"_a, "focal"_a,
-        "view"_a, "rays"_a, "xyz"_a, "offsets"_a, "observation"_a, "before"_a, "as_near"_a,
-        "support"_a, "around"_a, "fewest_around"_a,
+  m.def("floater_observations", &floater_observations, nb::kw_only(), "cam_from_world"_a, "focal"_a,
+        "view"_a, "rays"_a, "xyz"_a, "offsets"_a, "observation"_a, "distance_share"_a,
+        "near_ratio"_a, "support"_a, "square_width"_a, "fewest_in_square"_a,
         "Number of observations of each point as a floater, in front of what is around it.");
   m.def("points_in_view", &points_in_view, "cam_from_world"_a, "low"_a, "high"_a, "xyz"_a,
         "The points in front of a camera with rays within bounds: (index, xyz in the camera).");

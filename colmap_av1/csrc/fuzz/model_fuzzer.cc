@@ -86,7 +86,7 @@ void run_points(Input& input) {
   const Doubles xyz = reals(input, 3 * num_points);
   const Indices observation = indices(input, num_seen, num_seen);
   const Indices rows = offsets(input, num_points, num_seen);
-  const geometry::SeenPoints points{.cam_from_world = poses,
+  const geometry::ObservedPoints points{.cam_from_world = poses,
                                     .focal = focal,
                                     .view = view,
                                     .rays = rays,
@@ -101,11 +101,11 @@ void run_points(Input& input) {
   });
   refused_or([&] {
     const Indices counts =
-        geometry::hanging_observations(points, {.before = real(input),
-                                                .as_near = real(input),
+        geometry::floater_observations(points, {.distance_share = real(input),
+                                                .near_ratio = real(input),
                                                 .support = input.byte() % 5,
-                                                .around = real(input),
-                                                .fewest_around = input.byte() % 9});
+                                                .square_width = real(input),
+                                                .fewest_in_square = input.byte() % 9});
     for (std::size_t i = 0; i < counts.size(); ++i) {
       check(counts[i] >= 0 && counts[i] <= rows[i + 1] - rows[i],
             "points hang in images that see them");
@@ -208,8 +208,9 @@ void run_patches(Input& input) {
   refused_or([&] {
     const auto found = geometry::find_patches(patches, picture, places, max_move);
     for (std::size_t i = 0; i < num_sought; ++i) {
-      const bool is_found = std::isfinite(found.missed[i]);
-      check(found.missed[i] >= 0 && std::abs(found.likeness[i]) < 1.001F, "patches are compared");
+      const bool is_found = std::isfinite(found.forward_backward_error[i]);
+      check(found.forward_backward_error[i] >= 0 && std::abs(found.correlation[i]) < 1.001F,
+            "patches are compared");
       check(!is_found || (std::abs(found.xy[2 * i] - places[2 * i]) <= max_move &&
                           std::abs(found.xy[2 * i + 1] - places[2 * i + 1]) <= max_move),
             "patches are found near their start");

@@ -92,7 +92,7 @@ class Window {
   const Block<kSide>& grey() const { return grey_; }
 
   // Normalised cross-correlation of two windows.
-  float likeness(const Window& other) const {
+  float correlation(const Window& other) const {
     const Block<kSide> one = without_mean(grey_);
     const Block<kSide> two = without_mean(other.grey_);
     const float squares = product(one, one) * product(two, two);
@@ -224,8 +224,9 @@ FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
   const auto num_patches = static_cast<std::int64_t>(patches.pixels.size() / size);
   const FloatPicture picture(target, kMargin);
   FoundPatches found{.xy = {start.begin(), start.end()},
-                     .missed = std::vector<float>(count, std::numeric_limits<float>::infinity()),
-                     .likeness = std::vector<float>(count, -1.0F)};
+                     .forward_backward_error =
+                         std::vector<float>(count, std::numeric_limits<float>::infinity()),
+                     .correlation = std::vector<float>(count, -1.0F)};
   Block<kWindow + 2> around;
   Window<kWindow> sought;
   Window<kWindow> shown;
@@ -244,8 +245,8 @@ FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
     found.xy[2 * i + 1] = place->y;
     // One step of the backward search returns to the start if both windows have the same content.
     const Step back = shown.step_to(sought.grey());
-    found.missed[i] = std::max(std::abs(back.x), std::abs(back.y));
-    found.likeness[i] = sought.likeness(shown);
+    found.forward_backward_error[i] = std::max(std::abs(back.x), std::abs(back.y));
+    found.correlation[i] = sought.correlation(shown);
   }
   return found;
 }

@@ -21,9 +21,9 @@ struct CutPatches {
 
 // The positions of patches.
 struct FoundPatches {
-  std::vector<float> xy;        // [n][2]
-  std::vector<float> missed;    // [n] forward-backward error in pixels; inf: not found
-  std::vector<float> likeness;  // [n] normalised cross-correlation of both windows
+  std::vector<float> xy;                      // [n][2]
+  std::vector<float> forward_backward_error;  // [n] in pixels; inf: not found
+  std::vector<float> correlation;             // [n] normalised cross-correlation of both windows
 };
 
 // Searches for 11x11 pixels around the points of patches near the positions `start` [n][2], (x, y)

@@ -29,7 +29,7 @@ void check_indices(std::span<const std::int64_t> indices, std::size_t size) {
   }
 }
 
-void check(const SeenPoints& points) {
+void check(const ObservedPoints& points) {
   const std::size_t num_views = points.cam_from_world.size() / 12;
   if (points.focal.size() != 2 * num_views || points.rays.size() != 2 * points.view.size()) {
     throw std::invalid_argument("poses, focal lengths, views and rays do not fit each other");
@@ -48,19 +48,19 @@ struct InSquare {
 };
 
 // Counts the floaters among the points of one square, which are reordered.
-void count_hanging(std::span<InSquare> square, const HangingOptions& options,
+void count_floaters(std::span<InSquare> square, const FloaterOptions& options,
                    std::vector<std::int64_t>& counts) {
-  if (static_cast<std::int64_t>(square.size()) < options.fewest_around) return;
+  if (static_cast<std::int64_t>(square.size()) < options.fewest_in_square) return;
   const auto middle = square.begin() + static_cast<std::ptrdiff_t>(square.size() / 2);
   std::nth_element(square.begin(), middle, square.end(),
                    [](const InSquare& a, const InSquare& b) { return a.distance < b.distance; });
-  const double limit = options.before * middle->distance;
+  const double limit = options.distance_share * middle->distance;
   // After nth_element, points nearer than the median come before it.
   for (const InSquare& own : std::span(square.begin(), middle)) {
     if (!(own.distance < limit)) continue;
     const auto near = std::count_if(square.begin(), square.end(), [&](const InSquare& other) {
-      return other.distance <= own.distance * options.as_near &&
-             other.distance * options.as_near >= own.distance;
+      return other.distance <= own.distance * options.near_ratio &&
+             other.distance * options.near_ratio >= own.distance;
     });
     if (near < options.support) ++counts[static_cast<std::size_t>(own.point)];
   }
@@ -76,7 +76,7 @@ struct ByViews {
   std::vector<std::int64_t> bounds;  // view v has observations bounds[v] to bounds[v + 1] - 1
 };
 
-ByViews order_by_views(const SeenPoints& points, std::size_t num_views) {
+ByViews order_by_views(const ObservedPoints& points, std::size_t num_views) {
   ByViews out;
   out.bounds.resize(num_views + 1);
   const auto view_of = [&](std::int64_t i) {
@@ -99,7 +99,7 @@ ByViews order_by_views(const SeenPoints& points, std::size_t num_views) {
 
 }  // namespace
 
-std::vector<double> reprojection_errors(const SeenPoints& points) {
+std::vector<double> reprojection_errors(const ObservedPoints& points) {
   check(points);
   std::vector<double> errors(points.observation.size());
   for (std::size_t point = 0; point + 1 < points.offsets.size(); ++point) {
@@ -134,10 +134,10 @@ std::vector<double> widest_angles(std::span<const double> centres, std::span<con
   return angles;
 }
 
-std::vector<std::int64_t> hanging_observations(const SeenPoints& points,
-                                               const HangingOptions& options) {
+std::vector<std::int64_t> floater_observations(const ObservedPoints& points,
+                                               const FloaterOptions& options) {
   check(points);
-  if (!(options.around > 0)) throw std::invalid_argument("squares are wider than 0");
+  if (!(options.square_width > 0)) throw std::invalid_argument("squares are wider than 0");
   const std::size_t num_views = points.cam_from_world.size() / 12;
   const ByViews by_views = order_by_views(points, num_views);
   std::vector<std::int64_t> counts(points.xyz.size() / 3);
@@ -149,8 +149,8 @@ std::vector<std::int64_t> hanging_observations(const SeenPoints& points,
     for (std::int64_t i = by_views.bounds[view]; i < by_views.bounds[view + 1]; ++i) {
       const auto [point, observation] = by_views.seen[static_cast<std::size_t>(i)];
       const double* ray = points.rays.data() + 2 * observation;
-      const InSquare own{.row = std::floor(ray[1] * focal[1] / options.around),
-                         .column = std::floor(ray[0] * focal[0] / options.around),
+      const InSquare own{.row = std::floor(ray[1] * focal[1] / options.square_width),
+                         .column = std::floor(ray[0] * focal[0] / options.square_width),
                          .distance = length(between(centre.data(), points.xyz.data() + 3 * point)),
                          .point = point};
       // NaN cannot be sorted.
@@ -165,7 +165,7 @@ std::vector<std::int64_t> hanging_observations(const SeenPoints& points,
       const auto beyond = std::find_if(first, seen.end(), [&](const InSquare& other) {
         return other.row != first->row || other.column != first->column;
       });
-      count_hanging({first, beyond}, options, counts);
+      count_floaters({first, beyond}, options, counts);
       first = beyond;
     }
   }

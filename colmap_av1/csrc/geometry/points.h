@@ -8,7 +8,7 @@
 namespace colmap_av1::geometry {
 
 // A view of points and their observations in posed images, in compressed sparse row form.
-struct SeenPoints {
+struct ObservedPoints {
   std::span<const double> cam_from_world;     // [num_views][3][4]
   std::span<const double> focal;              // [num_views][2]; converts errors to pixels
   std::span<const std::int64_t> view;         // of each observation, with or without a point
@@ -20,7 +20,7 @@ struct SeenPoints {
 
 // Reprojection error in pixels of each observation of the points, in their order; infinite behind
 // the camera. Like all functions here, throws std::invalid_argument for inconsistent arrays.
-std::vector<double> reprojection_errors(const SeenPoints& points);
+std::vector<double> reprojection_errors(const ObservedPoints& points);
 
 // Largest triangulation angle in radians of points [n][3]. Only angles to the rays of a point's
 // first and last observation are compared, so the result can be slightly too small. 0 without
@@ -30,18 +30,21 @@ std::vector<double> widest_angles(std::span<const double> centres, std::span<con
                                   std::span<const std::int64_t> offsets,
                                   std::span<const std::int64_t> view);
 
-struct HangingOptions {
-  double before = 0;   // largest distance of a floater, as a share of the median in its square
-  double as_near = 0;  // points within this ratio of distances support each other
-  std::int64_t support = 0;        // with this many, including itself, it is not a floater
-  double around = 0;               // px; width of the squares
-  std::int64_t fewest_around = 0;  // squares with fewer points are ignored
+struct FloaterOptions {
+  // Largest distance of a floater, as a share of the median in its square.
+  double distance_share = 0;
+  // Points within this ratio of distances support each other. With so many, including itself, a
+  // point is not a floater.
+  double near_ratio = 0;
+  std::int64_t support = 0;
+  double square_width = 0;            // px
+  std::int64_t fewest_in_square = 0;  // squares with fewer points are ignored
 };
 
 // For each point, the number of its observations as a floater: nearer than most points in the same
 // square of the image, with hardly any other point at the same distance. Rays and points that are
 // not finite are ignored. Also throws if squares have no width.
-std::vector<std::int64_t> hanging_observations(const SeenPoints& points,
-                                               const HangingOptions& options);
+std::vector<std::int64_t> floater_observations(const ObservedPoints& points,
+                                               const FloaterOptions& options);
 
 }  // namespace colmap_av1::geometry

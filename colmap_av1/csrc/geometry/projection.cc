@@ -25,7 +25,7 @@ void append(const std::array<T, size>& from, std::size_t count, std::vector<T>& 
 // values of the chunk. Every point is written, and an invisible one is overwritten by the next:
 // this has no branches, because visibility is too random for branch prediction.
 template <typename Write, typename Take>
-void for_seen(std::span<const double, 12> cam_from_world, std::span<const double> xyz,
+void visit_visible(std::span<const double, 12> cam_from_world, std::span<const double> xyz,
               std::vector<std::int64_t>& seen, const Write& write, const Take& take) {
   const std::size_t total = xyz.size() / 3;
   std::array<std::int64_t, kChunk> index;
@@ -46,7 +46,7 @@ PointsInView points_in_view(std::span<const double, 12> cam_from_world, const Ra
                             std::span<const double> xyz) {
   PointsInView found;
   std::array<double, 3 * kChunk> local;
-  for_seen(
+  visit_visible(
       cam_from_world, xyz, found.index,
       [&](std::size_t place, const Vector& at) {
         std::copy(at.begin(), at.end(), local.begin() + static_cast<std::ptrdiff_t>(3 * place));
@@ -66,7 +66,7 @@ PointsInPicture points_in_picture(std::span<const double, 12> cam_from_world, co
   std::array<double, kChunk> depth;
   const double last_x = std::max(0.0, std::nextafter(camera.width, 0.0));
   const double last_y = std::max(0.0, std::nextafter(camera.height, 0.0));
-  for_seen(
+  visit_visible(
       cam_from_world, xyz, found.index,
       [&](std::size_t place, const Vector& at) {
         std::copy(at.begin(), at.end(), local.begin() + static_cast<std::ptrdiff_t>(3 * place));

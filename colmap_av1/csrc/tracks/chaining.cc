@@ -14,7 +14,7 @@ void Chainer::chain(ChainedFrame& current, std::span<Link> links, TrackStore& st
   current_ = &current;
   store_ = &store;
   cosine_.start_frame(current);
-  note_open_units(links);
+  collect_open_units(links);
   for (Link& link : links) {
     cosine_.prepare(current, link);
     if (link.forward) {
@@ -25,8 +25,8 @@ void Chainer::chain(ChainedFrame& current, std::span<Link> links, TrackStore& st
   }
 }
 
-// Records the units whose motion may continue a track into the current frame.
-void Chainer::note_open_units(std::span<const Link> links) {
+// Collects the units whose motion may continue a track into the current frame.
+void Chainer::collect_open_units(std::span<const Link> links) {
   open_units_.clear();
   if (std::all_of(links.begin(), links.end(), [](const Link& link) { return link.forward; })) {
     return;
@@ -54,11 +54,11 @@ bool Chainer::is_open(OpenUnit unit) const {
 }
 
 void Chainer::chain_backward(const Link& link) {
-  note_unplaced(*link.other);
+  collect_pending(*link.other);
   const int num_lists = current_->motion.num_lists;
   for (int list = 0; list < num_lists; ++list) chain_backward(link, list, Reach::kOwn);
   if (bridge_ <= 0.F) return;
-  for (int list = 0; list < num_lists; ++list) chain_backward(link, list, Reach::kBeside);
+  for (int list = 0; list < num_lists; ++list) chain_backward(link, list, Reach::kNeighbours);
 }
 
 // Uses the displacements of the current frame. Every free cell claims the longest track that it
@@ -67,7 +67,7 @@ void Chainer::chain_backward(const Link& link) {
 void Chainer::chain_backward(const Link& link, int list, Reach reach) {
   const auto& motion = current_->motion.lists[list];
   claims_.resize(link.other->cells.size());
-  beside_unit_ = -1;
+  neighbours_of_ = -1;
   // If a cell is as large as its unit, searching it is as fast as checking the unit first.
   const bool judges_units = grid_.cells > 1;
   std::size_t num_open = 0;
@@ -88,41 +88,41 @@ void Chainer::chain_backward(const Link& link, int list, Reach reach) {
   open_units_.resize(num_open);
   for (const std::int32_t cell : claimed_) {
     const Claim claim = std::exchange(claims_[cell], Claim{});
-    carry_on(*link.other, cell, claim.cell, claim);
-    note_placed(*link.other, cell);
+    continue_track(*link.other, cell, claim.cell, claim);
+    mark_continued(*link.other, cell);
   }
   claimed_.clear();
 }
 
-// Records the cells of a frame whose tracks are not yet continued into the current frame.
-void Chainer::note_unplaced(const ChainedFrame& other) {
-  unplaced_.resize(other.cells.size());
-  unplaced_units_.assign(other.motion.mi_size.size(), 0);
+// Collects the cells of a frame whose tracks are not yet continued into the current frame.
+void Chainer::collect_pending(const ChainedFrame& other) {
+  pending_.resize(other.cells.size());
+  pending_units_.assign(other.motion.mi_size.size(), 0);
   std::size_t cell = 0;
   for (int row = 0; row < other.cell_rows; ++row) {
-    std::uint8_t* unit = unplaced_units_.data() +
+    std::uint8_t* unit = pending_units_.data() +
                          static_cast<std::ptrdiff_t>(row >> grid_.log_cells) * other.motion.cols;
     for (int col = 0; col < other.cell_cols; ++col, ++cell) {
-      unplaced_[cell] = store_->is_unplaced(other.cells[cell], *current_) ? 1 : 0;
-      unit[col >> grid_.log_cells] |= unplaced_[cell];
+      pending_[cell] = store_->is_pending(other.cells[cell], *current_) ? 1 : 0;
+      unit[col >> grid_.log_cells] |= pending_[cell];
     }
   }
 }
 
 // Records that the track of a cell has been continued.
-void Chainer::note_placed(const ChainedFrame& other, int cell) {
-  unplaced_[cell] = 0;
+void Chainer::mark_continued(const ChainedFrame& other, int cell) {
+  pending_[cell] = 0;
   const int size = grid_.cells;
   const int row = cell / other.cell_cols >> grid_.log_cells;
   const int col = cell % other.cell_cols >> grid_.log_cells;
-  const std::uint8_t* first = unplaced_.data() +
+  const std::uint8_t* first = pending_.data() +
                               static_cast<std::ptrdiff_t>(size) * row * other.cell_cols +
                               static_cast<std::ptrdiff_t>(size) * col;
   std::uint8_t any = 0;
   for (int r = 0; r < size; ++r, first += other.cell_cols) {
     for (int c = 0; c < size; ++c) any |= first[c];
   }
-  unplaced_units_[row * other.motion.cols + col] = any;
+  pending_units_[row * other.motion.cols + col] = any;
 }
 
 // Whether the cells of a unit can find any track; otherwise they need not be searched.
@@ -130,7 +130,7 @@ bool Chainer::may_find_track(const Link& link, int unit, const UnitMotion& motio
                              Reach reach) const {
   // A valid warp stretches a unit by less than half its size, and neighbours move similarly.
   float pixels = 0.75F * kUnit;
-  if (reach == Reach::kBeside) {
+  if (reach == Reach::kNeighbours) {
     if (bridge_ > kUnit) return true;
     pixels += bridge_;
   }
@@ -140,44 +140,46 @@ bool Chainer::may_find_track(const Link& link, int unit, const UnitMotion& motio
   const int shift = grid_.log_cells;
   for (int row = window.top >> shift; row <= window.bottom >> shift; ++row) {
     for (int col = window.left >> shift; col <= window.right >> shift; ++col) {
-      if (unplaced_units_[row * link.other->motion.cols + col] != 0) return true;
+      if (pending_units_[row * link.other->motion.cols + col] != 0) return true;
     }
   }
   return false;
 }
 
 // Lets a cell claim a track. If another cell loses this track, it searches for another one in turn.
-void Chainer::claim_track(const Link& link, int list, Reach reach, Asker asker) {
+void Chainer::claim_track(const Link& link, int list, Reach reach, Searcher searcher) {
   while (true) {
     Found best;
     if (reach == Reach::kOwn) {
-      best = find_track(link, asker, current_->motion.lists[list][asker.unit], best);
+      best = find_track(link, searcher, current_->motion.lists[list][searcher.unit], best);
     } else {
-      note_motion_beside(link, list, asker.unit);
-      for (const UnitMotion* motion : beside_) best = find_track(link, asker, *motion, best);
+      collect_neighbour_motion(link, list, searcher.unit);
+      for (const UnitMotion* motion : neighbour_motion_) {
+        best = find_track(link, searcher, *motion, best);
+      }
     }
     if (best.cell < 0) return;
     if (claims_[best.cell].cell < 0) claimed_.push_back(best.cell);
     const int cell = std::exchange(claims_[best.cell], best.claim).cell;
     if (cell < 0) return;
-    asker = {cell, current_->unit_of(grid_, cell),
+    searcher = {cell, current_->unit_of(grid_, cell),
              grid_.centre(cell / current_->cell_cols, cell % current_->cell_cols)};
   }
 }
 
 // The longest track to which the motion of a unit leads, among those that no cell with a better
 // claim holds; `best` if that is longer.
-Chainer::Found Chainer::find_track(const Link& link, const Asker& asker, const UnitMotion& motion,
-                                   Found best) const {
+Chainer::Found Chainer::find_track(const Link& link, const Searcher& searcher,
+                                   const UnitMotion& motion, Found best) const {
   const ChainedFrame& other = *link.other;
-  const Point centre = asker.centre;
+  const Point centre = searcher.centre;
   // A valid warp stretches a unit by less than half its size, about the unit's centre.
   const float reach = motion.warp < 0 ? grid_.half_cell : grid_.half_cell + kUnit / 4.F;
   const Window window = around(link, {centre.x + motion.dx, centre.y + motion.dy}, reach);
   for (int row = window.top; row <= window.bottom; ++row) {
     for (int col = window.left; col <= window.right; ++col) {
       const int index = row * other.cell_cols + col;
-      if (unplaced_[index] == 0) continue;
+      if (pending_[index] == 0) continue;
       const Cell& found = other.cells[index];
       const Point target{found.position.x * link.from_picture_x,
                          found.position.y * link.from_picture_y};
@@ -185,7 +187,7 @@ Chainer::Found Chainer::find_track(const Link& link, const Asker& asker, const U
       if (!position || !grid_.is_in_cell(*position, centre)) continue;
       Claim claim;
       claim.position = *position;
-      claim.cell = asker.cell;
+      claim.cell = searcher.cell;
       claim.cost = distance(*position, centre);
       claim.variance = found.variance + motion.variance;
       if ((best.cell >= 0 && !is_preferred(other, index, claim, best.cell, best.claim)) ||
@@ -201,12 +203,12 @@ Chainer::Found Chainer::find_track(const Link& link, const Asker& asker, const U
   return best;
 }
 
-// Records the displacements of neighbouring units that the cells of a unit use as well. Where the
+// Collects the displacements of neighbouring units that the cells of a unit use as well. Where the
 // displacements of neighbouring blocks diverge, tracks lie in the gap between their targets.
-void Chainer::note_motion_beside(const Link& link, int list, int unit) {
-  if (unit == beside_unit_) return;
-  beside_unit_ = unit;
-  beside_.clear();
+void Chainer::collect_neighbour_motion(const Link& link, int list, int unit) {
+  if (unit == neighbours_of_) return;
+  neighbours_of_ = unit;
+  neighbour_motion_.clear();
   const TrustedMotion& frame = current_->motion;
   const int row = unit / frame.cols;
   const int col = unit % frame.cols;
@@ -221,11 +223,11 @@ void Chainer::note_motion_beside(const Link& link, int list, int unit) {
       if (!link.refs[other.ref] || !moves_alike(other, own, bridge_)) continue;
       // The cells have already searched there.
       if (is_same(other, own)) continue;
-      if (std::any_of(beside_.begin(), beside_.end(),
-                      [&](const UnitMotion* noted) { return is_same(other, *noted); })) {
+      if (std::any_of(neighbour_motion_.begin(), neighbour_motion_.end(),
+                      [&](const UnitMotion* used) { return is_same(other, *used); })) {
         continue;
       }
-      beside_.push_back(&other);
+      neighbour_motion_.push_back(&other);
     }
   }
 }
@@ -269,20 +271,20 @@ void Chainer::chain_forward(const Link& link, int list) {
     for (int col = 0; col < grid_.cells * other.motion.visible_cols; ++col) {
       const int cell = row * other.cell_cols + col;
       const int unit = (row >> grid_.log_cells) * other.motion.cols + (col >> grid_.log_cells);
-      if (link.refs[motion[unit].ref] && store_->is_unplaced(other.cells[cell], *current_)) {
-        push_track(link, cell, motion[unit]);
+      if (link.refs[motion[unit].ref] && store_->is_pending(other.cells[cell], *current_)) {
+        claim_cell(link, cell, motion[unit]);
       }
     }
   }
   for (const std::int32_t cell : claimed_) {
     const Claim claim = std::exchange(claims_[cell], Claim{});
-    carry_on(other, claim.cell, cell, claim);
+    continue_track(other, claim.cell, cell, claim);
   }
   claimed_.clear();
 }
 
 // Claims the cell of the current frame in which a track of the other frame lands.
-void Chainer::push_track(const Link& link, int cell, const UnitMotion& motion) {
+void Chainer::claim_cell(const Link& link, int cell, const UnitMotion& motion) {
   const ChainedFrame& other = *link.other;
   const Cell& source = other.cells[cell];
   const Point from{source.position.x / other.motion.upscale, source.position.y};
@@ -319,7 +321,7 @@ bool Chainer::is_preferred(const ChainedFrame& frame, int cell, const Claim& cla
 }
 
 // Continues the track in a cell of another frame into a cell of the current frame.
-void Chainer::carry_on(ChainedFrame& other, int other_cell, int cell, const Claim& claim) {
+void Chainer::continue_track(ChainedFrame& other, int other_cell, int cell, const Claim& claim) {
   std::int32_t track = other.cells[other_cell].track;
   if (track == kSeed) track = store_->start(other, static_cast<std::size_t>(other_cell));
   current_->cells[cell] = {

@@ -44,7 +44,7 @@ class Chainer {
     std::int32_t col = 0;
   };
   // A cell of the current frame that searches for a track.
-  struct Asker {
+  struct Searcher {
     int cell = -1;
     int unit = -1;
     Point centre;
@@ -57,29 +57,29 @@ class Chainer {
   };
   // Which displacements a cell uses to search for tracks: its unit's, or those of neighbouring
   // units.
-  enum class Reach { kOwn, kBeside };
+  enum class Reach { kOwn, kNeighbours };
 
-  void note_open_units(std::span<const Link> links);
+  void collect_open_units(std::span<const Link> links);
   bool is_open(OpenUnit unit) const;
 
   void chain_backward(const Link& link);
   void chain_backward(const Link& link, int list, Reach reach);
-  void note_unplaced(const ChainedFrame& other);
-  void note_placed(const ChainedFrame& other, int cell);
-  void note_motion_beside(const Link& link, int list, int unit);
+  void collect_pending(const ChainedFrame& other);
+  void mark_continued(const ChainedFrame& other, int cell);
+  void collect_neighbour_motion(const Link& link, int list, int unit);
   bool may_find_track(const Link& link, int unit, const UnitMotion& motion, Reach reach) const;
-  void claim_track(const Link& link, int list, Reach reach, Asker asker);
-  Found find_track(const Link& link, const Asker& asker, const UnitMotion& motion,
+  void claim_track(const Link& link, int list, Reach reach, Searcher searcher);
+  Found find_track(const Link& link, const Searcher& searcher, const UnitMotion& motion,
                    Found best) const;
   bool is_better(const Claim& claim, const Claim& holder) const;
   static Window around(const Link& link, Point position, float reach);
 
   void chain_forward(const Link& link, int list);
-  void push_track(const Link& link, int cell, const UnitMotion& motion);
+  void claim_cell(const Link& link, int cell, const UnitMotion& motion);
 
   bool is_preferred(const ChainedFrame& frame, int cell, const Claim& claim, int other_cell,
                     const Claim& other_claim) const;
-  void carry_on(ChainedFrame& other, int other_cell, int cell, const Claim& claim);
+  void continue_track(ChainedFrame& other, int other_cell, int cell, const Claim& claim);
 
   CellGrid grid_;
   float bridge_;  // in px; 0: off
@@ -94,11 +94,11 @@ class Chainer {
   std::vector<OpenUnit> open_units_;   // of the current frame, in raster order
   // For a frame with tracks: the cells whose tracks are not yet continued into the current frame,
   // and the units that have such cells.
-  std::vector<std::uint8_t> unplaced_;
-  std::vector<std::uint8_t> unplaced_units_;
+  std::vector<std::uint8_t> pending_;
+  std::vector<std::uint8_t> pending_units_;
   // For a unit of the current frame: the motion of its neighbours that its cells use, too.
-  int beside_unit_ = -1;
-  std::vector<const UnitMotion*> beside_;
+  int neighbours_of_ = -1;
+  std::vector<const UnitMotion*> neighbour_motion_;
 };
 
 }  // namespace colmap_av1::tracks

@@ -42,13 +42,13 @@ Point towards_neighbour(const TrustedMotion& motion, const std::vector<UnitMotio
 
 // The nearest unit with motion in one direction from a unit, and its distance in units. Null beyond
 // kMaxBridge.
-struct Bank {
+struct NearestMotion {
   const UnitMotion* motion = nullptr;
   int distance = 0;
 };
 
-Bank nearest_motion(const TrustedMotion& motion, const std::vector<UnitMotion>& units, int row,
-                    int col, Axis axis, int direction) {
+NearestMotion nearest_motion(const TrustedMotion& motion, const std::vector<UnitMotion>& units,
+                             int row, int col, Axis axis, int direction) {
   for (int distance = 1; distance <= kMaxBridge; ++distance) {
     (axis == Axis::kAcross ? col : row) += direction;
     if (!motion.is_visible(row, col)) break;
@@ -64,14 +64,14 @@ UnitMotion motion_between(const TrustedMotion& motion, const std::vector<UnitMot
   UnitMotion between;
   float total = 0.F;
   for (const Axis axis : {Axis::kAcross, Axis::kDown}) {
-    const Bank before = nearest_motion(motion, units, row, col, axis, -1);
-    const Bank behind = nearest_motion(motion, units, row, col, axis, 1);
-    if (before.motion == nullptr || behind.motion == nullptr) continue;
+    const NearestMotion before = nearest_motion(motion, units, row, col, axis, -1);
+    const NearestMotion after = nearest_motion(motion, units, row, col, axis, 1);
+    if (before.motion == nullptr || after.motion == nullptr) continue;
     const UnitMotion& a = *before.motion;
-    const UnitMotion& b = *behind.motion;
+    const UnitMotion& b = *after.motion;
     if (a.ref != b.ref || (between.ref != 0 && a.ref != between.ref)) continue;
     if (!moves_alike(a, b, limit)) return {};
-    const auto gap_units = static_cast<float>(before.distance + behind.distance);
+    const auto gap_units = static_cast<float>(before.distance + after.distance);
     const float share = static_cast<float>(before.distance) / gap_units;
     const float weight = 1.F / gap_units;
     const float gap = distance({a.dx, a.dy}, {b.dx, b.dy});

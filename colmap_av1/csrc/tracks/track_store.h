@@ -40,7 +40,7 @@ class TrackStore {
     return tracks_[cell.track].length;
   }
   // Whether a cell holds a track that is not continued into a frame yet.
-  bool is_unplaced(const Cell& cell, const ChainedFrame& frame) const {
+  bool is_pending(const Cell& cell, const ChainedFrame& frame) const {
     return cell.track == kSeed || (cell.track != kNoTrack && last_seen_[cell.track] != frame.order);
   }
 

@@ -11,7 +11,7 @@
 #include "av1/constants.h"
 #include "av1/spec_tables.h"
 #include "tracks/displacement.h"
-#include "tracks/even_motion.h"
+#include "tracks/affine_motion.h"
 #include "tracks/fill_motion.h"
 #include "tracks/trust.h"
 
@@ -20,8 +20,8 @@ namespace {
 
 using Verdict = TrustScratch::Verdict;
 
-// Approximate number of sampled units that decide whether a frame moves evenly.
-constexpr int kEvenSamples = 2048;
+// Approximate number of sampled units that show whether a frame has detail, and its affine motion.
+constexpr int kSpreadSamples = 2048;
 constexpr int kSuperblock = 16;  // in units; the smaller of the two sizes
 // If a smaller share of the sampled units is in small blocks, the picture shows no detail, or it
 // repeats another one exactly. For a camera that stands still, the share is at least 0.02.
@@ -106,7 +106,7 @@ TimedMotion timed(const TrustedMotion& motion, Point at, const Displacement& d) 
 template <typename Visit>
 void visit_spread_units(const TrustedMotion& motion, const Visit& visit) {
   const int num_units = motion.rows * motion.cols;
-  const int step = std::max(1, static_cast<int>(std::sqrt(num_units / kEvenSamples)));
+  const int step = std::max(1, static_cast<int>(std::sqrt(num_units / kSpreadSamples)));
   // Blocks in partial superblocks are excluded, because they are small for lack of space.
   for (int row = step / 2; row < motion.visible_rows / kSuperblock * kSuperblock; row += step) {
     for (int col = step / 2; col < motion.visible_cols / kSuperblock * kSuperblock; col += step) {
@@ -137,11 +137,11 @@ bool shows_detail(const FrameMotion& frame, const TrackBuilderOptions& options,
   return num_coded <= kRepeat * num_units && ref_has_detail[main_ref];
 }
 
-// The even motion in the frame's first list. There is none if all blocks are small enough, if fewer
-// than half of the sampled units have motion, or without detail: a picture of one colour seems to
-// stand still.
-EvenMotion even_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
-                       const DisplacementModel& model, const TrustedMotion& motion) {
+// The affine motion in the frame's first list. There is none if all blocks are small enough, if
+// fewer than half of the sampled units have motion, or without detail: a picture of one colour
+// seems to stand still.
+AffineMotion common_motion(const FrameMotion& frame, const TrackBuilderOptions& options,
+                           const DisplacementModel& model, const TrustedMotion& motion) {
   int num_units = 0;
   int num_large = 0;
   std::vector<TimedMotion> spread;
@@ -162,7 +162,7 @@ void read_displacements(const FrameMotion& frame, const TrackBuilderOptions& opt
                         const RefDetail& ref_has_detail, TrustedMotion& motion) {
   const DisplacementModel model(frame);
   motion.has_detail = shows_detail(frame, options, model, motion, ref_has_detail);
-  const EvenMotion even = even_motion(frame, options, model, motion);
+  const AffineMotion common = common_motion(frame, options, model, motion);
   const auto border = static_cast<float>(options.border.value_or(0));
   for (int row = 0; row < motion.visible_rows; ++row) {
     for (int col = 0; col < motion.visible_cols; ++col) {
@@ -173,7 +173,7 @@ void read_displacements(const FrameMotion& frame, const TrackBuilderOptions& opt
       for (int list = 0; list < motion.num_lists; ++list) {
         const Displacement d = model.at(unit, list);
         if (d.ref == 0 || !options.is_within_reach(motion.ref_interval[d.ref])) continue;
-        if (!small && !even.agrees(timed(motion, centre, d))) continue;
+        if (!small && !common.agrees(timed(motion, centre, d))) continue;
         if (border > 0.F &&
             !is_within_border(motion, border, centre, {centre.x + d.dx, centre.y + d.dy})) {
           continue;

@@ -1,1 +1,1 @@
-"""Metrics of tracks, poses, clouds and renderings."""
+"""Metrics of poses, clouds and renderings."""

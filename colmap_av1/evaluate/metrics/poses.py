@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from colmap_av1.errors import ImageError
 from colmap_av1.geometry.alignment import transform_poses
 from colmap_av1.geometry.colmap_model import camera_centres, posed_images
+from colmap_av1.images.names import last_number
 from colmap_av1.util.texts import read_lines
 
 # Largest error of an inlier of the robust alignment, in the unit of the ground truth.
@@ -102,10 +102,8 @@ def pose_errors(
     if similarity is None:
         return None
     both = _in_both(cam_from_world, truth)
-    aligned, true_centres = (
-        transform_poses(similarity, cam_from_world[both]),
-        camera_centres(truth[both]),
-    )
+    aligned = transform_poses(similarity, cam_from_world[both])
+    true_centres = camera_centres(truth[both])
     distance = np.linalg.norm(camera_centres(aligned) - true_centres, axis=1)
     angle = _rotation_errors(cam_from_world[both][:, :, :3], truth[both][:, :, :3])
     relative = _relative_errors(aligned, truth[both])
@@ -161,10 +159,10 @@ def frame_number(name: str) -> int:
     Raises:
         ImageError: the name has no number.
     """
-    numbers = re.findall(r"\d+", Path(name).stem)
-    if not numbers:
+    number = last_number(name)
+    if number is None:
         raise ImageError(f"image '{name}': its name has no frame number: rename it")
-    return int(numbers[-1])
+    return number
 
 
 def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:

@@ -47,12 +47,12 @@ class Split:
     """A model with undistorted images, complete and split into training and test images.
 
     Attributes:
-        data: folder with all images in `images/` and the model in `sparse/0/`.
+        whole: folder with all images in `images/` and the model in `sparse/0/`.
         train: the same with the training images, the even ones in the order of their names.
         test: the same with the test images.
     """
 
-    data: Path
+    whole: Path
     train: Path
     test: Path
 
@@ -122,20 +122,20 @@ def write_split(model: Path, image_path: Path, folder: Path) -> Split:
         )
 
     def make() -> dict[str, Any]:
-        run_measured(_undistort, model, image_path, split.data, registered, log=folder / "log.txt")
+        run_measured(_undistort, model, image_path, split.whole, registered, log=folder / "log.txt")
         halves = split_images(registered)
         for part, names in zip((split.train, split.test), halves, strict=True):
             (part / "sparse" / "0").mkdir(parents=True)
             for name in names:
                 target = part / "images" / name
                 target.parent.mkdir(parents=True, exist_ok=True)
-                _link(split.data / "images" / name, target)
-            _write_part(split.data / "sparse" / "0", part / "sparse" / "0", set(names))
+                _link(split.whole / "images" / name, target)
+            _write_part(split.whole / "sparse" / "0", part / "sparse" / "0", set(names))
         return {}
 
     files = [*sorted(model.glob("*.bin")), *(image_path / name for name in registered)]
     given = ([file_digest(file) for file in files], pycolmap.__version__)
-    run_stage_in(folder, given, make, products=[split.data, split.train, split.test])
+    run_stage_in(folder, given, make, products=[split.whole, split.train, split.test])
     return split
 
 
@@ -173,7 +173,7 @@ def train(
         ColmapAv1Error: the trainer failed, or did not render the test images.
     """
     renders, references = folder / "renders", split.references
-    inputs = [p for part in ("sparse/0", "images") for p in (split.data / part).rglob("*")]
+    inputs = [p for part in ("sparse/0", "images") for p in (split.whole / part).rglob("*")]
     given = [file_digest(path) for path in sorted(inputs) if path.is_file()]
     names = [reference.name for reference in references]
     stops = tuple(sorted({stop for stop in milestones if stop < iterations}))
@@ -184,7 +184,7 @@ def train(
             path.mkdir()
         if trainer == GSPLAT:
             scene = folder / "scene.npz"
-            write_scene(split.data / "sparse" / "0", split.data / "images", scene)
+            write_scene(split.whole / "sparse" / "0", split.whole / "images", scene)
             command = [sys.executable, *map(str, (_PROGRAM, scene, renders, *stops))]
         else:
             command = _command(

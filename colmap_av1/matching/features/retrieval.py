@@ -35,8 +35,8 @@ def similar_images(
         int32 [m, 2] indices of images, first < second, ascending.
     """
     vectors = _aggregate(features, seed)
-    likeness = np.where(allowed, vectors @ vectors.T, -np.inf)
-    order = np.argsort(-likeness, axis=1, kind="stable")[:, :num_nearest]
+    similarity = np.where(allowed, vectors @ vectors.T, -np.inf)
+    order = np.argsort(-similarity, axis=1, kind="stable")[:, :num_nearest]
     pairs = {
         (min(i, j), max(i, j))
         for i, row in enumerate(order.tolist())

@@ -94,13 +94,13 @@ def match_features(a: Features, b: Features) -> NDArray[np.uint32]:
     """
     if min(len(a.xy), len(b.xy)) < 2:
         return np.empty((0, 2), dtype=np.uint32)
-    likeness = a.descriptors @ b.descriptors.T
-    rows = np.arange(len(likeness))
-    nearest = likeness.argmax(axis=1)
-    is_mutual = likeness.argmax(axis=0)[nearest] == rows
-    best = likeness[rows, nearest]
-    likeness[rows, nearest] = -1
-    second = likeness.max(axis=1)
+    similarity = a.descriptors @ b.descriptors.T
+    rows = np.arange(len(similarity))
+    nearest = similarity.argmax(axis=1)
+    is_mutual = similarity.argmax(axis=0)[nearest] == rows
+    best = similarity[rows, nearest]
+    similarity[rows, nearest] = -1
+    second = similarity.max(axis=1)
     angle, second_angle = (np.arccos(np.clip(x, -1, 1)) for x in (best, second))
     kept = is_mutual & (angle <= _MAX_ANGLE) & (angle <= _MAX_RATIO * second_angle)
     return np.column_stack([rows[kept], nearest[kept]]).astype(np.uint32)

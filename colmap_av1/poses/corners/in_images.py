@@ -33,20 +33,20 @@ _MAX_ERROR = 8.0
 
 
 def corners_in_images(
-    run: Run, moving: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
+    run: Run, dynamic_masks: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
 ) -> tuple[Tracks, PosedImages]:
     """Find corners in the images of all videos, and correct poses that contradict them.
 
     Args:
         run: inputs and options of the run.
-        moving: masks that exclude dynamic pixels, by image name.
+        dynamic_masks: masks that exclude dynamic pixels, by image name.
         tracks: tracks of static points, which guide the search.
         placed: the registered images.
 
     Returns:
         The corners as tracks, and the images with the corrected poses.
     """
-    masks = placed.masks_with(moving)
+    masks = placed.masks_with(dynamic_masks)
     with GreyPictures(run.stages) as pictures:
         followed = _followed(run, masks, tracks, placed, pictures)
         placed = resect_from_corners(run, followed, placed)

@@ -236,7 +236,7 @@ def _found_in(
     seen = place[index] >= 0
     expected[seen] = at[place[index[seen]]] / scale
     grey = pictures.read(number)
-    found, missed, likeness = _core.find_patches(
+    found, error, correlation = _core.find_patches(
         patches.grey,
         index,
         middle=patches.fraction[index].astype(np.float32),
@@ -245,7 +245,7 @@ def _found_in(
         start=expected.astype(np.float32),
         max_move=_MAX_MOVE,
     )
-    sure = (missed <= _MAX_RETURN) & (likeness >= _MIN_CORRELATION)
+    sure = (error <= _MAX_RETURN) & (correlation >= _MIN_CORRELATION)
     margin = _WINDOW // 2
     sure &= ((found >= margin) & (found < np.array(size) - margin)).all(axis=1)
     xy = found * scale

@@ -211,13 +211,13 @@ class Contradictions:
             (placed.residual > _SURELY_CONTRADICTS) & (placed.lengths >= _SURE_LENGTH)
         )
 
-    def by_depth(self, moving: _Bools) -> _Bools:
+    def by_depth(self, dynamic: _Bools) -> _Bools:
         """Tracks whose points would occlude other points, or are seen through a surface.
 
         Args:
-            moving: bool [num_tracks] tracks known to be dynamic, which are not used as evidence.
+            dynamic: bool [num_tracks] tracks known to be dynamic, which are not used as evidence.
         """
-        agreeing = self._agreeing & ~moving
+        agreeing = self._agreeing & ~dynamic
         hiding = self._hiding(agreeing)
         return hiding | self._seen_through(agreeing & ~hiding)
 

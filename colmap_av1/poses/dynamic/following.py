@@ -41,7 +41,7 @@ def has_changing_masks(image_set: ImageSet) -> bool:
 
 
 def follow_behind(
-    run: Run, moving: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
+    run: Run, dynamic_masks: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
 ) -> Tracks:
     """Refine tracks on the pictures, and find their points in more images.
 
@@ -52,14 +52,14 @@ def follow_behind(
 
     Args:
         run: inputs and options of the run.
-        moving: masks that exclude dynamic pixels, by image name.
+        dynamic_masks: masks that exclude dynamic pixels, by image name.
         tracks: tracks of static points; few, since each is searched in many pictures.
         placed: the registered images.
 
     Returns:
         A track for each point, in these images, without outliers.
     """
-    masks = placed.masks_with(moving)
+    masks = placed.masks_with(dynamic_masks)
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.shown)):
         own = np.flatnonzero(placed.sequence == video)

@@ -60,17 +60,17 @@ def dynamic_cells(
     """
     found = Contradictions(placed, views, num_threads=num_threads)
     by_motion, surely = found.by_motion, found.surely_by_motion
-    moving = np.zeros(len(by_motion), np.bool_)
+    dynamic = np.zeros(len(by_motion), np.bool_)
     cells = np.zeros(placed.shape, np.bool_)
     for _ in range(_PASSES):
-        by_depth = found.by_depth(moving)
-        behind = found.unseen(by_depth | moving)
+        by_depth = found.by_depth(dynamic)
+        behind = found.unseen(by_depth | dynamic)
         votes = np.where(by_depth | surely, 1.0, np.where(by_motion, _MOTION_VOTE, 0.0))
         share = shares_above_usual(placed, votes, ~cells)
         cells = _sure_regions(placed, share, behind)
         if not cells.any():
             return cells
-        cells, moving = _cells_of_tracks(placed, cells, by_motion | by_depth)
+        cells, dynamic = _cells_of_tracks(placed, cells, by_motion | by_depth)
     return _closed(strong_patches(cells, share))
 
 
@@ -141,13 +141,13 @@ def _cells_of_tracks(
 ) -> tuple[_Bools, _Bools]:
     """The cells in which most tracks are dynamic, and the dynamic tracks."""
     every = _sum_around(placed.counts(np.ones(len(contradicts))), _NEAR)
-    moving = np.zeros(len(contradicts), np.bool_)
+    dynamic = np.zeros(len(contradicts), np.bool_)
     for _ in range(2):
         within = placed.mean(cells[placed.image, placed.row, placed.column])
-        moving = (within > _MOSTLY) | ((within > _PARTLY) & contradicts)
-        around = _sum_around(placed.counts(moving), _NEAR)
+        dynamic = (within > _MOSTLY) | ((within > _PARTLY) & contradicts)
+        around = _sum_around(placed.counts(dynamic), _NEAR)
         cells = (around > _MOSTLY * every) & (around > _MIN_DYNAMIC - 0.5)
-    return cells, moving
+    return cells, dynamic
 
 
 def _closed(cells: _Bools) -> _Bools:
@@ -173,5 +173,5 @@ def _closed(cells: _Bools) -> _Bools:
 def mask_of_cells(cells: _Bools, cell: int, size: tuple[int, int]) -> Mask:
     """A mask of (width, height) that excludes cells [rows, columns]."""
     width, height = size
-    moving = np.repeat(np.repeat(cells, cell, axis=0), cell, axis=1)[:height, :width]
-    return make_mask(~moving)
+    dynamic = np.repeat(np.repeat(cells, cell, axis=0), cell, axis=1)[:height, :width]
+    return make_mask(~dynamic)

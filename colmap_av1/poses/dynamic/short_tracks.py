@@ -11,7 +11,7 @@ from colmap_av1.geometry.colmap_model import ModelPoints
 _MIN_IMAGES = 5
 
 
-def static_points(points: ModelPoints, shows_moving: NDArray[np.bool_]) -> NDArray[np.int64]:
+def static_points(points: ModelPoints, shows_dynamic: NDArray[np.bool_]) -> NDArray[np.int64]:
     """The points that are very likely static.
 
     In a few images, a point in uniform motion looks like a static point at another depth: only in
@@ -20,7 +20,7 @@ def static_points(points: ModelPoints, shows_moving: NDArray[np.bool_]) -> NDArr
 
     Args:
         points: points of tracks outside dynamic pixels.
-        shows_moving: bool [num_images] which images have dynamic pixels.
+        shows_dynamic: bool [num_images] which images have dynamic pixels.
 
     Returns:
         int64 [n] their indices, ascending.
@@ -28,5 +28,5 @@ def static_points(points: ModelPoints, shows_moving: NDArray[np.bool_]) -> NDArr
     if len(points.xyz) == 0:
         return np.empty(0, np.int64)
     count = np.diff(points.offsets)
-    is_doubtful = np.logical_and.reduceat(shows_moving[points.image], points.offsets[:-1])
+    is_doubtful = np.logical_and.reduceat(shows_dynamic[points.image], points.offsets[:-1])
     return np.flatnonzero(~is_doubtful | (count >= _MIN_IMAGES))

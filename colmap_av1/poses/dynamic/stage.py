@@ -24,7 +24,7 @@ from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.util.progress import no_progress
 from colmap_av1.util.stages import Kept, run_stage
 
-_FILE = "moving.npz"
+_FILE = "dynamic.npz"
 # Width in pixels of a cell, of which one track is examined, in pictures of up to the usual width.
 # Larger pictures have proportionally larger cells.
 _CELL = 8
@@ -38,10 +38,10 @@ class DynamicResult:
     """What `dynamic_stage` found, apart from the masks it stores.
 
     Attributes:
-        moving: share of dynamic pixels in all images.
+        share: share of dynamic pixels in all images.
     """
 
-    moving: float
+    share: float
 
 
 def dynamic_stage(
@@ -52,19 +52,19 @@ def dynamic_stage(
     def make(partial: Path) -> DynamicResult:
         placed = read_posed_images(run, posed, image_set)
         found: dict[str, Mask] = {}
-        with run.clock.measure("moving"):
+        with run.clock.measure("dynamic"):
             for video in range(len(image_set.videos)):
                 own = np.flatnonzero(placed.sequence == video)
                 if len(own) >= _MIN_IMAGES:
                     found |= _dynamic_masks(run, tracks, placed, own)
-                run.progress("moving", video + 1, len(image_set.videos))
+                run.progress("dynamic", video + 1, len(image_set.videos))
         _write(partial / _FILE, found)
         left_out = sum(1.0 - mask.share for mask in found.values()) / len(placed.images)
         return DynamicResult(left_out)
 
     return run_stage(
         run.stages,
-        "moving",
+        "dynamic",
         [posed.digest],
         DynamicResult,
         into=run.stages,
@@ -86,14 +86,14 @@ def read_dynamic_masks(stages: Path) -> dict[str, Mask]:
 
 
 def without_dynamic_tracks(
-    tracks: Tracks, image_set: ImageSet, moving: Mapping[str, Mask], run: Run
+    tracks: Tracks, image_set: ImageSet, dynamic_masks: Mapping[str, Mask], run: Run
 ) -> Tracks:
     """The tracks of all sequences outside dynamic pixels, see `mask_tracks`."""
     images = image_set.images
     by_frame = {
-        frame: moving[name]
+        frame: dynamic_masks[name]
         for frame, name in zip(images.frames.tolist(), images.names, strict=True)
-        if name in moving
+        if name in dynamic_masks
     }
     if not by_frame:
         return tracks
@@ -153,7 +153,7 @@ def _dynamic_masks(
     placed_tracks = place_tracks(seen, image, points, views, cell=cell)
     cells = dynamic_cells(placed_tracks, views, num_threads=num_threads)
     return {
-        own_image.name: mask_of_cells(moving, cell, size)
-        for own_image, moving in zip(images, cells, strict=True)
-        if moving.any()
+        own_image.name: mask_of_cells(dynamic, cell, size)
+        for own_image, dynamic in zip(images, cells, strict=True)
+        if dynamic.any()
     }

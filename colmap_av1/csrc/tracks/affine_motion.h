@@ -1,4 +1,5 @@
-// Frames with even motion, from a camera that stands still or moves along a flat surface.
+// A single affine motion of a whole frame, from a camera that stands still or moves along a flat
+// surface.
 #pragma once
 
 #include <span>
@@ -16,11 +17,11 @@ struct TimedMotion {
 
 // The single affine motion of a frame. Encoders code such frames in their largest blocks. In other
 // frames large blocks are not trusted, because they show plain surfaces that any vector predicts.
-class EvenMotion {
+class AffineMotion {
  public:
   // `spread` are moving units that are spread over the whole picture. If fewer than nine in ten of
   // them agree with a single affine motion, nothing agrees.
-  EvenMotion(std::span<const TimedMotion> spread, double width, double height);
+  AffineMotion(std::span<const TimedMotion> spread, double width, double height);
 
   bool agrees(const TimedMotion& motion) const;
 
@@ -28,7 +29,7 @@ class EvenMotion {
   bool fits(const TimedMotion& motion) const;
 
   DominantMotion velocity_;  // px per shown frame
-  bool is_even_ = false;
+  bool is_common_ = false;
 };
 
 }  // namespace colmap_av1::tracks

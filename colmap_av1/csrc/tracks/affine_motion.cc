@@ -1,4 +1,4 @@
-#include "tracks/even_motion.h"
+#include "tracks/affine_motion.h"
 
 #include <algorithm>
 #include <cmath>
@@ -13,7 +13,7 @@ constexpr double kWithin = 0.25;  // px, the resolution of most vectors
 
 }  // namespace
 
-EvenMotion::EvenMotion(std::span<const TimedMotion> spread, double width, double height) {
+AffineMotion::AffineMotion(std::span<const TimedMotion> spread, double width, double height) {
   std::vector<MotionSample> samples;
   samples.reserve(spread.size());
   for (const TimedMotion& motion : spread) {
@@ -27,12 +27,12 @@ EvenMotion::EvenMotion(std::span<const TimedMotion> spread, double width, double
   velocity_ = fit_dominant_motion(samples, width, height, scratch);
   const auto agreeing = std::count_if(spread.begin(), spread.end(),
                                       [&](const TimedMotion& motion) { return fits(motion); });
-  is_even_ = static_cast<double>(agreeing) >= kShare * static_cast<double>(spread.size());
+  is_common_ = static_cast<double>(agreeing) >= kShare * static_cast<double>(spread.size());
 }
 
-bool EvenMotion::agrees(const TimedMotion& motion) const { return is_even_ && fits(motion); }
+bool AffineMotion::agrees(const TimedMotion& motion) const { return is_common_ && fits(motion); }
 
-bool EvenMotion::fits(const TimedMotion& motion) const {
+bool AffineMotion::fits(const TimedMotion& motion) const {
   if (!velocity_.valid || motion.interval == 0) return false;
   const MotionSample& at = motion.sample;
   return std::abs(at.dx - motion.interval * velocity_.dx(at.x, at.y)) <= kWithin &&
