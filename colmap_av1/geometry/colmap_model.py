@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError, ModelError
 from colmap_av1.geometry.cameras import camera_fault
 from colmap_av1.util.files import may_read
+from colmap_av1.util.grouping import grouped
 from colmap_av1.util.texts import check_name
 
 _FILES = ("cameras", "images", "points3D")
@@ -245,8 +246,7 @@ def write_model(
 
     lengths = np.diff(points.offsets)
     owner = np.repeat(np.arange(len(lengths)), lengths)
-    by_image = np.argsort(points.image, kind="stable")
-    bounds = np.searchsorted(points.image[by_image], np.arange(len(images) + 1))
+    by_image, bounds = grouped(points.image, len(images))
     place = np.empty(len(points.image), dtype=np.int64)
     place[by_image] = np.arange(len(by_image)) - np.repeat(bounds[:-1], np.diff(bounds))
     with (folder / "images.bin").open("wb") as file:

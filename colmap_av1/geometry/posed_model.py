@@ -24,6 +24,7 @@ from colmap_av1.geometry.colmap_model import (
     no_points,
     posed_images,
 )
+from colmap_av1.util.grouping import grouped
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,7 @@ def reprojection_errors(model: PosedModel) -> NDArray[np.float64]:
     points = model.points
     xyz = np.repeat(points.xyz, np.diff(points.offsets), axis=0)
     errors = np.full(len(points.image), np.inf)
-    by_image = np.argsort(points.image, kind="stable")
-    bounds = np.searchsorted(points.image[by_image], np.arange(len(model.images) + 1))
+    by_image, bounds = grouped(points.image, len(model.images))
     for image, first, last in zip(model.images, bounds[:-1], bounds[1:], strict=True):
         own = by_image[first:last]
         in_camera = xyz[own] @ image.cam_from_world[:, :3].T + image.cam_from_world[:, 3]

@@ -13,6 +13,7 @@ from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.digests import seed_of
+from colmap_av1.util.grouping import grouped
 from colmap_av1.util.threads import map_on_threads
 
 _Floats = NDArray[np.float64]
@@ -71,8 +72,8 @@ def sightings_of(
     place = np.full(tracks.num_frames, -1, dtype=np.int64)
     place[frames] = np.arange(len(frames))
     rows = np.flatnonzero((place[tracks.frame] >= 0) & (point[number] >= 0))
-    rows = rows[np.argsort(place[tracks.frame[rows]], kind="stable")]
-    bounds = np.searchsorted(place[tracks.frame[rows]], np.arange(len(frames) + 1))
+    order, bounds = grouped(place[tracks.frame[rows]], len(frames))
+    rows = rows[order]
     xy = tracks.xy[rows].astype(np.float64)
     rays = np.empty(xy.shape)
     for camera, first_row, last_row in zip(cameras, bounds[:-1], bounds[1:], strict=True):

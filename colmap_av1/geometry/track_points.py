@@ -16,6 +16,7 @@ from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, 
 from colmap_av1.geometry.undistortion import Undistortion
 from colmap_av1.options import TrackOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.grouping import grouped
 from colmap_av1.util.progress import Progress
 
 _Image = NDArray[np.uint8]
@@ -153,9 +154,7 @@ class Colours:
 
     def __init__(self, points: ModelPoints, sizes: Sequence[tuple[int, int]]) -> None:
         self._points, self._sizes = points, np.array(sizes)
-        self._order = np.argsort(points.image, kind="stable")
-        ordered = points.image[self._order]
-        self._bounds = np.searchsorted(ordered, np.arange(len(sizes) + 1))
+        self._order, self._bounds = grouped(points.image, len(sizes))
         self._seen = np.zeros((len(points.image), 3), np.uint8)
 
     def add(self, image: int, picture: _Image, undistortion: Undistortion | None = None) -> None:
@@ -200,8 +199,7 @@ def mean_reprojection_errors(
     """
     lengths = np.diff(points.offsets)
     owner = np.repeat(np.arange(len(lengths)), lengths)
-    order = np.argsort(points.image, kind="stable")
-    bounds = np.searchsorted(points.image[order], np.arange(len(views) + 1))
+    order, bounds = grouped(points.image, len(views))
     apart = np.empty(len(points.image))
     for image, view in enumerate(views):
         own = order[bounds[image] : bounds[image + 1]]

@@ -27,7 +27,8 @@ from colmap_av1.images.names import (
 )
 from colmap_av1.images.recognising import check_content, frames_by_content
 from colmap_av1.options import ImageOptions
-from colmap_av1.tracks.tracks import Tracks, order_by_frame
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.grouping import grouped
 from colmap_av1.util.texts import read_lines
 
 _Image = NDArray[np.uint8]
@@ -180,12 +181,12 @@ def parallax(tracks: Tracks) -> NDArray[np.float64]:
     focal = _FOCAL_LENGTH * max(tracks.width, tracks.height)
     number = tracks.track
     step = np.flatnonzero((np.diff(number) == 0) & (np.diff(tracks.frame) == 1))
-    order = step[order_by_frame(tracks.frame[step], tracks.num_frames)]
-    bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames))
+    order, bounds = grouped(tracks.frame[step], tracks.num_frames)
+    step = step[order]
     centre = np.array([tracks.width, tracks.height]) / 2
     found = np.full(max(tracks.num_frames - 1, 0), np.nan)
     for frame in range(len(found)):
-        steps = order[bounds[frame] : bounds[frame + 1]]
+        steps = step[bounds[frame] : bounds[frame + 1]]
         if len(steps) < 3:
             continue
         steps = steps[:: -(-len(steps) // _MAX_STEPS)]
@@ -475,8 +476,7 @@ def _rotation_field(
 def _tracks_by_frame(tracks: Tracks) -> Callable[[int], NDArray[np.int64]]:
     """A function that returns the tracks observed in a frame, ascending."""
     number = tracks.track
-    order = tracks.order_by_frame()
-    bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
+    order, bounds = tracks.by_frame()
     return lambda frame: number[order[bounds[frame] : bounds[frame + 1]]]
 
 

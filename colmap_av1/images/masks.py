@@ -315,8 +315,7 @@ def mask_tracks(
     of_all, by_frame = (masks.kept, {}) if isinstance(masks, Mask) else (None, masks)
     kept = np.ones(tracks.num_observations, dtype=np.bool_)
     begins = np.zeros(tracks.num_observations, dtype=np.bool_)
-    order = tracks.order_by_frame()
-    bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
+    order, bounds = tracks.by_frame()
     unseen = _Unseen(tracks)
     for frame, (first, last) in enumerate(pairwise(bounds.tolist())):
         pixels = by_frame[frame].kept if frame in by_frame else of_all

@@ -16,6 +16,7 @@ from colmap_av1.matching.mapper_limits import (
     REGISTRATION_MIN_INLIERS,
 )
 from colmap_av1.util.graphs import connected_components
+from colmap_av1.util.grouping import grouped
 
 _Floats = NDArray[np.float64]
 
@@ -67,9 +68,8 @@ class Growth:
                 self._rays[self._offsets[i] : self._offsets[i + 1]] = rays
         self._num_tracks = 1 + int(self._track.max(initial=-1))
         # The views of each track, one track after the other.
-        order = np.argsort(self._track, kind="stable")
+        order, self._bounds = grouped(self._track, self._num_tracks)
         self._views = views[order]
-        self._bounds = np.searchsorted(self._track[order], np.arange(self._num_tracks + 1))
 
     def registered(self, pair: Sequence[int], max_images: int | None = None) -> NDArray[np.bool_]:
         """Which images the mapper registers.

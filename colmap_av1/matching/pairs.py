@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
 from colmap_av1.options import PairOptions
-from colmap_av1.tracks.tracks import Tracks, order_by_frame
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.grouping import grouped
 
 # Spans up to this many images are paired at every image. Longer spans are paired at every n-th
 # image only, where n grows with the span, so the number of pairs stays linear in the number of
@@ -75,8 +76,8 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
     kept = np.flatnonzero(seen & often_enough[track])
 
     # Observations are ordered by track, so a stable sort by image keeps tracks ascending.
-    kept = kept[order_by_frame(image[kept], chosen.size)]
-    bounds = np.searchsorted(image[kept], np.arange(chosen.size + 1))
+    order, bounds = grouped(image[kept], chosen.size)
+    kept = kept[order]
     return [
         ImageKeypoints(
             frame=int(frame),

@@ -23,6 +23,7 @@ from colmap_av1.poses.posed_images import (
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.grouping import grouped
 from colmap_av1.util.stages import Kept, run_stage
 
 # Largest number of tracks whose points determine which images overlap; short ones are ignored.
@@ -116,6 +117,5 @@ def _points_by_image(run: Run, tracks: Tracks, placed: PosedImages) -> list[NDAr
     seen, view = seen_in(pose_tracks(run, some), placed.frames)
     points = triangulate_in(run, placed, seen, view, options=FOR_POSES)
     xyz = np.repeat(points.xyz, np.diff(points.offsets), axis=0)
-    order = np.argsort(view[points.observation], kind="stable")
-    bounds = np.searchsorted(view[points.observation][order], np.arange(1, len(placed.images)))
-    return np.split(xyz[order], bounds)
+    order, bounds = grouped(view[points.observation], len(placed.images))
+    return np.split(xyz[order], bounds[1:-1])

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.colmap_model import ModelImage
+from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.matching.mapper_limits import (
     INITIAL_MAX_FORWARD_MOTION,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
 )
+from colmap_av1.util.grouping import grouped
 from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
@@ -98,10 +99,9 @@ def _candidates(
     point: NDArray[np.int64], view: NDArray[np.int64], xyz: _Floats, images: list[ModelImage]
 ) -> Iterator[_Candidate]:
     poses = np.array([image.cam_from_world for image in images])
-    centres = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
-    by_view = np.argsort(view, kind="stable")
-    bounds = np.searchsorted(view[by_view], np.arange(1, len(images)))
-    seen = np.split(point[by_view], bounds)
+    centres = camera_centres(poses)
+    by_view, bounds = grouped(view, len(images))
+    seen = np.split(point[by_view], bounds[1:-1])
     for first in evenly_spread(len(images), _NUM_FIRST):
         for second in (first + span for span in _SPANS if first + span < len(images)):
             common = np.intersect1d(seen[first], seen[second], assume_unique=True)

@@ -30,6 +30,7 @@ from colmap_av1.splats.ray_search import (
     smaller,
     sweep_image,
 )
+from colmap_av1.util.grouping import grouped
 from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
@@ -144,8 +145,7 @@ class Sweep:
 def _nearest_observed(points: ModelPoints, views: Sequence[PosedCamera]) -> list[_Floats]:
     """Depth of the nearest observed point in each cell of each image; inf without one."""
     owner = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
-    by_image = np.argsort(points.image, kind="stable")
-    bounds = np.searchsorted(points.image[by_image], np.arange(len(views) + 1))
+    by_image, bounds = grouped(points.image, len(views))
     grids = []
     for image, view in enumerate(views):
         own = by_image[bounds[image] : bounds[image + 1]]

@@ -78,8 +78,7 @@ def follow_corners(
         Tracks with observations in at least three pictures; their frames are those of `guide` and
         their positions are in pixels of the pictures.
     """
-    by_frame = guide.order_by_frame()
-    bounds = np.searchsorted(guide.frame[by_frame], np.arange(guide.num_frames + 1))
+    by_frame, bounds = guide.by_frame()
     track = guide.track
 
     def observations(frame: int) -> NDArray[np.int64]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.tracks.tracks import Tracks, order_by_frame
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.grouping import grouped
 
 # Largest motion of an overlay in pixels: the finest step of a motion vector.
 _STILL = 0.125
@@ -53,13 +54,13 @@ def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
     step = _length(tracks.xy[to] - tracks.xy[to - 1])
     frame = tracks.frame[to]
     step /= frame - tracks.frame[to - 1]
-    count = np.bincount(frame, minlength=tracks.num_frames)
-    by_frame = np.split(step[order_by_frame(frame, tracks.num_frames)], np.cumsum(count)[:-1])
+    order, bounds = grouped(frame, tracks.num_frames)
+    by_frame = np.split(step[order], bounds[1:-1])
     # For each frame with observations, the number of frames since the previous one with any.
     observed = np.flatnonzero(np.bincount(tracks.frame))
     since = dict(zip(observed[1:].tolist(), np.diff(observed).tolist(), strict=True))
     motion = np.zeros(tracks.num_frames)
-    for index in np.flatnonzero(count).tolist():
+    for index in np.flatnonzero(np.diff(bounds)).tolist():
         middle = len(by_frame[index]) // 2
         motion[index] = np.partition(by_frame[index], middle)[middle] * since[index]
     return motion

@@ -146,8 +146,7 @@ def match_tracks(
     Arguments and errors are those of `refine_tracks`.
     """
     state = RefinedTracks.start(tracks, options, expected)
-    by_frame = tracks.order_by_frame()
-    bounds = np.searchsorted(tracks.frame[by_frame], np.arange(tracks.num_frames + 1))
+    by_frame, bounds = tracks.by_frame()
     next_frame = 0
     for count, (index, image) in enumerate(frames, start=1):
         if index < next_frame or index >= tracks.num_frames:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.options import DensityOptions
-from colmap_av1.tracks.tracks import Tracks, order_by_frame
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.grouping import grouped
 
 
 @dataclass(frozen=True)
@@ -150,8 +151,8 @@ def _error_shares(
         return np.zeros(tracks.num_frames, dtype=np.float32)
     shares = np.full(tracks.num_frames, _MAX_ERROR_SHARE, dtype=np.float32)
     usable = np.flatnonzero(error <= _MAX_ERROR_SHARE * distance)
-    usable = usable[order_by_frame(tracks.frame[usable], tracks.num_frames)]
-    bounds = np.searchsorted(tracks.frame[usable], np.arange(tracks.num_frames + 1))
+    order, bounds = grouped(tracks.frame[usable], tracks.num_frames)
+    usable = usable[order]
     for frame, (start, stop) in enumerate(pairwise(bounds)):
         own = usable[start:stop]
         if len(own) <= wide_tracks:

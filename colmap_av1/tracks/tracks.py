@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from colmap_av1 import _core
 from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import TrackOptions
+from colmap_av1.util.grouping import grouped
 from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.display import Display, shown_points, shown_size
@@ -141,9 +141,9 @@ class Tracks:
             confirmed=np.concatenate([video.confirmed for video in videos]),
         )
 
-    def order_by_frame(self) -> NDArray[np.int64]:
-        """Indices of the observations sorted by frame; within a frame they keep their order."""
-        return order_by_frame(self.frame, self.num_frames)
+    def by_frame(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Order of the observations by frame, and the bounds of the frames in it, see `grouped`."""
+        return grouped(self.frame, self.num_frames)
 
     def keep_observations(self, kept: NDArray[np.bool_]) -> Tracks:
         """Keep some of the observations.
@@ -213,10 +213,8 @@ class Tracks:
         if len(repeats) == 0:
             return self
         # The observations of each frame, and how often they are repeated.
-        order = self.order_by_frame()
-        starts = np.searchsorted(self.frame[order], first[repeats], side="left")
-        ends = np.searchsorted(self.frame[order], first[repeats], side="right")
-        copies = [order[start:end] for start, end in zip(starts, ends, strict=True)]
+        order, bounds = self.by_frame()
+        copies = [order[bounds[frame] : bounds[frame + 1]] for frame in first[repeats].tolist()]
         source = np.concatenate([np.arange(self.num_observations), *copies])
         added = np.repeat(repeats, [len(copy) for copy in copies])
         frame = np.concatenate([self.frame, added.astype(np.int32)])
@@ -392,12 +390,6 @@ def build_tracks(
         raise VideoError("the video shows no frame: give a video with at least one picture")
     confirmed = np.zeros(len(frame_index), dtype=np.bool_)
     return Tracks(num_frames, width, height, offsets, frame_index, xy, sigma, confirmed)
-
-
-def order_by_frame(frame: NDArray[np.integer[Any]], num_frames: int) -> NDArray[np.int64]:
-    """Indices of observations sorted by frame; within a frame they keep their order."""
-    # NumPy sorts two-byte integers by radix sort, in a quarter of the time.
-    return np.argsort(frame.astype(np.min_scalar_type(num_frames)), kind="stable")
 
 
 def least_length(options: TrackOptions) -> int:

@@ -149,7 +149,7 @@ class _Drawing:
 
 def _prepare(tracks: Tracks, options: ViewOptions) -> _Drawing:
     length = tracks.lengths
-    by_frame = tracks.order_by_frame()
+    by_frame, bounds = tracks.by_frame()
     step = np.diff(tracks.xy, axis=0, prepend=tracks.xy[:1])
     interval = np.diff(tracks.frame, prepend=tracks.frame[:1])
     starts = tracks.offsets[:-1][length > 1]
@@ -161,7 +161,7 @@ def _prepare(tracks: Tracks, options: ViewOptions) -> _Drawing:
         tracks=tracks,
         options=options,
         by_frame=by_frame,
-        bounds=np.searchsorted(tracks.frame[by_frame], np.arange(tracks.num_frames + 1)),
+        bounds=bounds,
         age=np.arange(tracks.num_observations) - np.repeat(tracks.offsets[:-1], length),
         velocity=velocity,
         full_speed=max(full_speed, _LEAST_FULL_SPEED),

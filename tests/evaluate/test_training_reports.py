@@ -38,7 +38,7 @@ def split(tmp_path: Path) -> Split:
     """Four images; this trainer needs no model."""
     made = Split(tmp_path / "data", tmp_path / "train", tmp_path / "test")
     rng = np.random.default_rng(0)
-    halves = (made.data, NAMES), (made.train, NAMES[::2]), (made.test, NAMES[1::2])
+    halves = (made.whole, NAMES), (made.train, NAMES[::2]), (made.test, NAMES[1::2])
     for part, names in halves:
         (part / "images").mkdir(parents=True)
         for name in names:
@@ -48,13 +48,13 @@ def split(tmp_path: Path) -> Split:
 
 
 def train_with(split: Split, program: str, milestones: tuple[int, ...] = (2, 6)) -> Training:
-    script = split.data.parent / "train.py"
+    script = split.whole.parent / "train.py"
     script.write_text(program)
     command = f"{shlex.join([sys.executable, str(script)])} {{test}} {{renders}} {{milestones}}"
     return train(
         f"{command} {{data}}",
         split,
-        split.data.parent / "training",
+        split.whole.parent / "training",
         name="av1",
         iterations=8,
         milestones=milestones,
@@ -97,7 +97,7 @@ def test_missing_output_of_a_command_is_reported(
     assert old in TRAINER
     with pytest.raises(EvaluationError, match=message):
         train_with(split, TRAINER.replace(old, new))
-    assert not (split.data.parent / "training" / "result.json").exists()
+    assert not (split.whole.parent / "training" / "result.json").exists()
 
 
 def column(name: str, *states: tuple[int, float, float]) -> Column:

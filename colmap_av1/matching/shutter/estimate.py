@@ -111,8 +111,7 @@ def _views(tracks: Tracks, down: tuple[int, int], seed: int) -> list[_View]:
     speed = velocities(tracks)
     place = row_places(tracks.xy, (tracks.width, tracks.height), down)
     centre = np.array([tracks.width, tracks.height]) / 2
-    order = np.argsort(tracks.frame, kind="stable")
-    bounds = np.searchsorted(tracks.frame[order], np.arange(tracks.num_frames + 1))
+    order, bounds = tracks.by_frame()
     number = tracks.track
     views = []
     last = tracks.num_frames - 1 - _GAPS[0]

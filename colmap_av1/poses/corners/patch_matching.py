@@ -23,6 +23,7 @@ from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.slopes import surface_slopes
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.grouping import grouped
 from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.threads import map_on_threads
 
@@ -109,8 +110,7 @@ def match_patches(
     point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
     image, xy = view[points.observation], corners.xy[points.observation].astype(np.float64)
     middle = (points.offsets[:-1] + points.offsets[1:]) // 2
-    by_image = np.argsort(image, kind="stable")
-    bounds = np.searchsorted(image[by_image], np.arange(len(views) + 1))
+    by_image, bounds = grouped(image, len(views))
     patches = _cut(points, middle, image, xy, views=views, pictures=pictures)
     found = [(np.arange(len(points.xyz)), image[middle], xy[middle])]
 

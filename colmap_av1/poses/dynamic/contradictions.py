@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.triangulation import SIGMA_FLOOR, TriangulatedPoints
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.grouping import grouped
 from colmap_av1.util.threads import map_on_threads
 
 _Floats = NDArray[np.float64]
@@ -130,8 +131,7 @@ def place_tracks(
     owner = track[points.observation[points.offsets[:-1]]]
     xyz[owner[order]] = points.xyz[order]
     error, depth = np.full(len(track), np.nan), np.full(len(track), np.nan)
-    by_image = np.argsort(image, kind="stable")
-    bounds = np.searchsorted(image[by_image], np.arange(len(views) + 1))
+    by_image, bounds = grouped(image, len(views))
     for number, view in enumerate(views):
         own = by_image[bounds[number] : bounds[number + 1]]
         own = own[np.isfinite(xyz[track[own], 0])]
@@ -188,8 +188,7 @@ class Contradictions:
         num_threads: int | None = None,
     ) -> None:
         self._placed, self._num_threads = placed, num_threads
-        by_image = np.argsort(placed.image, kind="stable")
-        bounds = np.searchsorted(placed.image[by_image], np.arange(len(views) + 1))
+        by_image, bounds = grouped(placed.image, len(views))
         self._seen = [by_image[a:b] for a, b in itertools.pairwise(bounds)]
         there = np.flatnonzero(np.isfinite(placed.xyz[:, 0]))
 
