@@ -28,12 +28,16 @@ SPLATS = DensifyOptions(match=MatchOptions(images=ImageOptions(first_number=0)))
 def true_model(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A model of the exact poses, without points and without image files."""
     folder = tmp_path_factory.mktemp("true")
+    write_poses(folder, truth, truth.camera)
+    return folder
+
+
+def write_poses(folder: Path, truth: Truth, camera: pycolmap.Camera) -> None:
     images = [
         ModelImage(i + 1, f"{frame:04d}.png", 7, truth.cam_from_world[frame])
         for i, frame in enumerate(FRAMES)
     ]
-    write_model(folder, {7: truth.camera}, images, no_points())
-    return folder
+    write_model(folder, {7: camera}, images, no_points())
 
 
 @pytest.fixture(scope="module")
@@ -104,12 +108,8 @@ def test_images_may_be_smaller_than_the_video(truth: Truth, tmp_path: Path) -> N
     """Few tracks have 25 observations, so that most points are found in the pictures."""
     half = pycolmap.Camera(truth.camera.todict())
     half.rescale(0.5)
-    images = [
-        ModelImage(i + 1, f"{frame:04d}.png", 7, truth.cam_from_world[frame])
-        for i, frame in enumerate(FRAMES)
-    ]
     (tmp_path / "true").mkdir()
-    write_model(tmp_path / "true", {7: half}, images, no_points())
+    write_poses(tmp_path / "true", truth, half)
     long_tracks = replace(SPLATS, triangulate=TriangulateOptions(min_observations=25))
     report = densify(tmp_path / "true", SCENE, tmp_path / "dense", options=long_tracks)
     assert report.coverage > 0.99

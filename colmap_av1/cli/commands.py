@@ -266,10 +266,9 @@ def _info(namespace: argparse.Namespace) -> None:
             from colmap_av1.matching.shutter.of_video import estimate_video_read_out
 
             read_out = estimate_video_read_out(namespace.video, options, report)
-    if read_out is None or isinstance(read_out, str):  # a text says why it is not observable
-        write_report_json(namespace, result, read_out=read_out)
-    else:
-        write_report_json(namespace, result, read_out=asdict(read_out))
+    # A text says why it is not observable.
+    found = read_out if read_out is None or isinstance(read_out, str) else asdict(read_out)
+    write_report_json(namespace, result, read_out=found)
     print_summary([*reports.info_rows(result), *reports.read_out_rows(read_out)])
 
 

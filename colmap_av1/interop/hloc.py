@@ -113,7 +113,7 @@ def export_hloc(
                 raise DatabaseError(f"{path}: has no keypoints: match its images first")
             num_pairs = _write_pairs(
                 connection, path, matches, pairs, names=names, counts=counts,
-                options=options, report=progress,
+                options=options, progress=progress,
             )  # fmt: skip
     return len(counts), num_pairs
 
@@ -167,7 +167,9 @@ def _complete_files(folder: Path) -> Iterator[tuple[_Write, _Write, Any]]:
                     parent.rmdir()
 
 
-def _write_features(connection: Any, path: Path, write: _Write, report: Progress) -> dict[int, int]:
+def _write_features(
+    connection: Any, path: Path, write: _Write, progress: Progress
+) -> dict[int, int]:
     """Write all images; returns the number of keypoints of each image, by its id."""
     rows = connection.execute(
         "SELECT image_id, name, COALESCE(width, 0), COALESCE(height, 0) FROM images "
@@ -184,7 +186,7 @@ def _write_features(connection: Any, path: Path, write: _Write, report: Progress
         counts[image_id] = len(xy)
         write(f"{name}/keypoints", _to_hloc(xy)).attrs["uncertainty"] = 1.0
         write(f"{name}/image_size", np.array([width, height], dtype=np.int64))
-        report("images", done, len(rows))
+        progress("images", done, len(rows))
     return counts
 
 
@@ -209,7 +211,7 @@ def _write_pairs(
     names: dict[int, str],
     counts: dict[int, int],
     options: ExportOptions,
-    report: Progress,
+    progress: Progress,
 ) -> int:
     table = "two_view_geometries" if options.verified else "matches"
     pair_ids = connection.execute(
@@ -238,7 +240,7 @@ def _write_pairs(
         write(f"{group}/matches0", matches0)
         write(f"{group}/matching_scores0", (matches0 != _NO_MATCH).astype(np.float16))
         pairs.write(f"{names[i]} {names[j]}\n")
-        report("pairs", done, len(pair_ids))
+        progress("pairs", done, len(pair_ids))
     return len(pair_ids)
 
 

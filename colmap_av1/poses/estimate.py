@@ -90,6 +90,11 @@ class Posed:
         return self.adjustment or self.resection or self.mapped
 
     @property
+    def masks_digest(self) -> str | None:
+        """Digest of the stage that found dynamic objects; None if there are none."""
+        return self.dynamic.digest if self.dynamic is not None and self.dynamic_masks else None
+
+    @property
     def resumed(self) -> list[str]:
         """Names of the stages that an earlier run finished, in order."""
         stages: dict[str, Kept[object] | None] = {
@@ -357,7 +362,7 @@ def _long_range_check(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongR
         image_set,
         posed.dynamic_masks,
         posed.last,
-        masked=posed.dynamic.digest if posed.dynamic is not None else None,
+        masked=posed.masks_digest,
         linked=posed.matches.result.links.looked_again,
     )
 
@@ -417,7 +422,7 @@ def _adjusted(
         posed.links,
         image_set,
         poses,
-        moved=posed.dynamic.digest if posed.dynamic is not None and dynamic_masks else None,
+        masked=posed.masks_digest,
         follow=partial(follow_behind, run, dynamic_masks) if follows else None,
         corners=partial(corners_in_images, run, dynamic_masks) if has_picture_positions else None,
         is_fast=bool(posed.matches.result.links.fast),

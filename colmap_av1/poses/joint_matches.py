@@ -94,7 +94,7 @@ class JointEstimate:
 
     Attributes:
         num_registered: number of registered images of each model, the largest first. The other
-            figures describe the one that was estimated first, mostly the largest.
+            figures describe the one that was estimated first, usually the largest.
         long_range: median long-range epipolar error in pixels, over pairs of images ten or more
             apart; None if no such images have enough matches.
         long_range_largest: its 90th percentile.

@@ -66,7 +66,7 @@ def long_range_stage(
         image_set: the images.
         dynamic_masks: masks that exclude dynamic pixels, by image name.
         posed: the stage that estimated the poses.
-        masked: digest of the stage that made the masks; None without one.
+        masked: digest of the stage that made the masks; None without masks.
         linked: whether loop closures have been searched.
     """
 

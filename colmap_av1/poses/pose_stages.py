@@ -367,7 +367,7 @@ def adjustment_stage(
     image_set: ImageSet,
     posed: Kept[PosesResult],
     *,
-    moved: str | None = None,
+    masked: str | None = None,
     follow: Callable[[Tracks, PosedImages], Tracks] | None = None,
     corners: Callable[[Tracks, PosedImages], tuple[Tracks, PosedImages]] | None = None,
     is_fast: bool = False,
@@ -385,7 +385,8 @@ def adjustment_stage(
         links: links as tracks.
         image_set: the images.
         posed: the stage with the initial poses.
-        moved: digest of the stage that found dynamic objects, if `tracks` and `links` exclude them.
+        masked: digest of the stage that found dynamic objects, if `tracks` and `links` exclude
+            them.
         follow: refines the selected tracks in the registered images.
         corners: finds corners in the pictures of the registered images, and corrects poses that
             contradict them.
@@ -462,7 +463,7 @@ def adjustment_stage(
     return run_stage(
         run.stages,
         f"adjustment{suffix}",
-        [posed.digest, settings, moved],
+        [posed.digest, settings, masked],
         AdjustedResult,
         into=run.stages,
         products=[f"adjusted{suffix}.npz"],

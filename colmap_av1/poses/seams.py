@@ -51,10 +51,10 @@ class Seams:
 
     Only points with at least three views count. A model may be bent at seams of these kinds:
 
-    - `doubtful`: much fewer points than usual connect the sides;
-    - `few_points`: even fewer, a part of these;
-    - `disconnected`: a part of `few_points` whose sides share no points elsewhere either;
-    - `scale_lost`: points connect the sides, but hardly any has depth on both.
+    - `doubtful`: far fewer points than usual connect the sides;
+    - `few_points`: the doubtful seams that even fewer points connect;
+    - `disconnected`: those of `few_points` whose sides share few points elsewhere either;
+    - `scale_lost`: points connect the sides, but hardly any of them have depth on both.
 
     Attributes:
         pairs: names of the images before and after each seam, in natural order.
@@ -83,7 +83,7 @@ class Seams:
 
     @property
     def doubtful(self) -> list[int]:
-        """Indices of seams with much fewer points than the others."""
+        """Indices of seams with far fewer points than the others."""
         return self._below(_DOUBTFUL)
 
     @property

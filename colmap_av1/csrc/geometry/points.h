@@ -33,9 +33,9 @@ std::vector<double> widest_angles(std::span<const double> centres, std::span<con
 struct FloaterOptions {
   // Largest distance of a floater, as a share of the median in its square.
   double distance_share = 0;
-  // Points within this ratio of distances support each other. With so many, including itself, a
-  // point is not a floater.
+  // Points support each other if the ratio of their distances is at most this.
   double near_ratio = 0;
+  // A point that this many points support, itself included, is not a floater.
   std::int64_t support = 0;
   double square_width = 0;            // px
   std::int64_t fewest_in_square = 0;  // squares with fewer points are ignored
