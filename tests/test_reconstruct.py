@@ -445,6 +445,22 @@ def test_failed_long_range_check_adds_loop_closures(
     assert "long_range" in reconstruct(SCENE, copy, options=options).resumed
 
 
+def test_failed_long_range_check_adds_loop_closures_outside_fast_stretches(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At first, loop closures are only searched in the stretch with fast motion."""
+    monkeypatch.setattr("colmap_av1.poses.long_range._MAX_ERROR", 0.0)
+    monkeypatch.setattr(
+        "colmap_av1.poses.track_stage.fast_frames", lambda tracks: np.arange(tracks.num_frames) < 12
+    )
+    for record in (copy / ".stages").glob("*.json"):
+        record.unlink()
+    found = reconstruct(SCENE, copy, options=OPTIONS)
+    assert found.links.fast == ((0, 9),)  # every third frame is an image, so this is four images
+    assert found.links.num_images > 4
+    assert found.links.looked_again
+
+
 def test_warning_names_images_that_are_not_registered(
     copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

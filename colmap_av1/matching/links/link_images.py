@@ -45,6 +45,7 @@ from colmap_av1.matching.links.plan import (
     Plan,
     first_look,
     plan_links,
+    searches_all,
     spread_over_videos,
     thorough_plan,
 )
@@ -135,6 +136,7 @@ def link_images(
                 matched,
                 cameras,
                 features,
+                images_apart=images_apart,
                 offsets=pairs.offsets,
                 verify=verify,
                 options=links,
@@ -185,6 +187,7 @@ def _link(
     cameras: Sequence[pycolmap.Camera],
     features: dict[int, Features],
     *,
+    images_apart: float,
     offsets: Sequence[int],
     verify: VerifyOptions,
     options: LinkOptions,
@@ -226,7 +229,7 @@ def _link(
     merged = merge_links(matched, links, features, [*contradicted, *linked])
     report = LinkReport(
         num_images=len(plan.wanted),
-        looked_again=bool(plan.loop),
+        looked_again=searches_all(plan, image_set, matched, images_apart),
         num_tried=len(tried | neighbours),
         num_links=len(links.pairs),
         num_revisits=len(loops & found),

@@ -184,6 +184,17 @@ def thorough_plan(plan: Plan, image_set: ImageSet) -> Plan:
     return replace(plan, between=between, effort="full")
 
 
+def searches_all(
+    plan: Plan, image_set: ImageSet, matched: MatchedImages, images_apart: float
+) -> bool:
+    """Whether loop closures are searched in images spread over all videos, not only parts of them.
+
+    In stretches with fast motion, other images are searched than elsewhere.
+    """
+    in_fast = {image for images in plan.fast for image in images}
+    return in_fast.union(plan.loop).issuperset(spread_over_videos(image_set, matched, images_apart))
+
+
 def spread_over_videos(
     image_set: ImageSet, matched: MatchedImages, images_apart: float
 ) -> list[int]:

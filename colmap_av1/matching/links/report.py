@@ -18,7 +18,7 @@ class LinkReport:
 
     Attributes:
         num_images: images whose pictures were examined.
-        looked_again: whether loop closures were searched.
+        looked_again: whether loop closures were searched in all videos.
         num_tried: pairs whose features were matched.
         num_links: pairs that were linked.
         num_revisits: linked pairs that close a loop.
