@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 
 import numpy as np
@@ -25,6 +26,9 @@ _RECTILINEAR = (*_UNDISTORTED, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV
 _INITIAL_SHARE, _INITIAL_FISHEYE_SHARE = 0.9, 0.5
 # Plausible focal lengths in units of the longer image side: fields of view from 118 to 11 degrees.
 _SHORTEST, _LONGEST = 0.3, 5.0
+# Longer focal lengths, in units of the longer image side, are rare in videos: fields of view below
+# 45 degrees. With little parallax, a mapper may converge to twice the true focal length.
+_LONG = 1.2
 # Larger image sides in pixels are damaged data.
 _LONGEST_SIDE = 1 << 20
 # Encoders round the display size of scaled pictures, by a few tenths of a percent.
@@ -100,6 +104,25 @@ def focal_length_warning(cameras: Iterable[pycolmap.Camera]) -> str | None:
                 f"of {camera.width}x{camera.height}: give --camera_model and --camera_params"
             )
     return None
+
+
+def has_long_focal_length(camera: pycolmap.Camera) -> bool:
+    """Whether the focal length is longer than in most videos, as with a telephoto lens."""
+    return bool(camera.mean_focal_length() > _LONG * max(camera.width, camera.height))
+
+
+def with_initial_intrinsics(camera: pycolmap.Camera) -> pycolmap.Camera:
+    """A camera of the same model with the focal length of a new camera, and without distortion."""
+    initial = copy.copy(camera)
+    share = _INITIAL_FISHEYE_SHARE if is_fisheye(camera.model_name) else _INITIAL_SHARE
+    params = np.array(camera.params)
+    params[camera.focal_length_idxs()] *= (
+        share * max(camera.width, camera.height) / camera.mean_focal_length()
+    )
+    params[camera.extra_params_idxs()] = 0.0
+    initial.params = params.tolist()
+    initial.has_prior_focal_length = False
+    return initial
 
 
 def is_undistorted(camera: pycolmap.Camera) -> bool:

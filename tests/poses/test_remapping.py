@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pycolmap
+import pytest
+from conftest import Ffmpeg
 
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
@@ -11,6 +15,7 @@ from colmap_av1.geometry.track_points import tracks_of_points
 from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.pairs import covisible_pairs, image_keypoints
 from colmap_av1.poses.remapping import RemappedResult
+from colmap_av1.reconstruct import reconstruct
 from colmap_av1.tracks.tracks import Tracks
 
 NUM_IMAGES = 30
@@ -72,8 +77,12 @@ def test_covisible_images_are_paired() -> None:
 
 
 def test_second_mapping_is_used_if_it_fits_at_least_as_well() -> None:
-    def result(kept: float, new_cost: float, share: float = 1.0) -> RemappedResult:
-        return RemappedResult("", 3, {}, "global", (), share, kept, cost=1.0, new_cost=new_cost)
+    def result(
+        kept: float, new_cost: float, *, share: float = 1.0, from_initial: bool = False
+    ) -> RemappedResult:
+        return RemappedResult(
+            "", 3, {}, "global", (), share, kept, 1.0, new_cost, from_initial=from_initial
+        )
 
     assert result(kept=0.97, new_cost=0.8).fits(0.9)
     assert result(kept=0.97, new_cost=1.0).fits(0.9)
@@ -81,6 +90,21 @@ def test_second_mapping_is_used_if_it_fits_at_least_as_well() -> None:
     assert not result(kept=0.5, new_cost=0.1).fits(0.9)
     assert result(kept=0.5, new_cost=0.1).fits(0.3)
     assert not result(kept=0.97, new_cost=0.1, share=0.2).fits(0.9)
+    assert not result(kept=0.97, new_cost=1.0, from_initial=True).fits(0.9)
+    assert result(kept=0.97, new_cost=0.9, from_initial=True).fits(0.9)
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+def test_wrong_long_focal_length_is_replaced(shared: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    """The first mapping of this clip of a narrow field of view gives six times the true one."""
+    video = ffmpeg(
+        *("-i", shared / "sequences" / "kitchen_long" / "clip.av1.mp4"),
+        *("-vf", "select=between(n\\,200\\,320),crop=320:240,setpts=N/30/TB", "-r", "30"),
+        *("-c:v", "libx264", "-crf", "18", tmp_path / "clip.mp4"),
+    )
+    report = reconstruct(video, tmp_path / "out")
+    assert report.focal_lengths == pytest.approx((517, 517), rel=0.25)
 
 
 def tracks_of_lengths(length: int, num_frames: int = 60) -> Tracks:
