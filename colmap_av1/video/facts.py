@@ -7,6 +7,7 @@ import dataclasses
 import os
 import re
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,7 +23,6 @@ from colmap_av1.video.container import (
     VideoFile,
     describe,
     find_decodable_stream,
-    find_video_stream,
     open_container,
     open_stream,
     until_damage,
@@ -137,7 +137,7 @@ def _checked_edits(
             "the container's time scale is invalid: its times and its edit list are ignored, all "
             "frames are used, and the frame rate is unknown"
         )
-    presented = _presented_frames(file.path, num_entries)
+    presented = _presented_frames(file, num_entries)
     if presented is None or len(presented) >= _MIN_SHOWN or num_entries < _MIN_SHOWN:
         return presented, None
     return None, (
@@ -146,21 +146,19 @@ def _checked_edits(
     )
 
 
-def _presented_frames(path: Path, num_entries: int) -> NDArray[np.int32] | None:
+def _presented_frames(file: VideoFile, num_entries: int) -> NDArray[np.int32] | None:
     """`Video.presented` of a file whose container lists `num_entries` samples without edits."""
-    with open_container(path, apply_edits=True) as edited:
-        entries = list(find_video_stream(edited, path).index_entries)
+    with open_container(file.path, apply_edits=True) as edited:
+        entries = list(edited.streams[file.index].index_entries)
         # The entries lie in the container's memory and must be read while it is open.
         shown = {entry.pos for entry in entries if not entry.is_discard}
     if len(shown) == num_entries or not entries:
         return None
     # Packets come in coding order, which can differ from the order of the pictures.
-    packets: list[tuple[int, bool]] = []
-    with open_container(path) as container, until_damage():
-        demuxed = container.demux(find_video_stream(container, path))
-        for number, packet in enumerate(p for p in demuxed if p.size):
-            time = packet.pts if packet.pts is not None else number
-            packets.append((time, packet.pos in shown))
+    packets = [
+        (packet.pts if packet.pts is not None else number, packet.pos in shown)
+        for number, packet in enumerate(_packets_before_damage(file))
+    ]
     packets.sort(key=lambda packet: packet[0])
     return np.flatnonzero([is_shown for _, is_shown in packets]).astype(np.int32)
 
@@ -197,17 +195,20 @@ def picture_times(video: Video) -> NDArray[np.float64] | None:
         VideoError: the file cannot be opened.
     """
     times: list[float] = []
-    with (
-        open_container(video.path) as container,
-        until_damage(),
-    ):
-        for packet in container.demux(container.streams[video.index]):
-            if packet.size and packet.pts is None:
-                return None
-            if packet.size:
-                times.append(float(packet.pts * packet.time_base))
+    for packet in _packets_before_damage(video):
+        if packet.pts is None:
+            return None
+        times.append(float(packet.pts * packet.time_base))
     # Packets come in coding order, which can differ from the order of the pictures.
     return np.sort(np.array(times)) if times else None
+
+
+def _packets_before_damage(file: VideoFile) -> Iterator[Any]:
+    """PyAV's packets of the video stream, in coding order."""
+    with open_container(file.path) as container, until_damage():
+        for packet in container.demux(container.streams[file.index]):
+            if packet.size:  # PyAV marks the end with an empty packet
+                yield packet
 
 
 def with_counted_packets(file: _File) -> _File:
@@ -218,11 +219,7 @@ def with_counted_packets(file: _File) -> _File:
     """
     if file.num_packets is not None:
         return file
-    count = 0
-    with open_container(file.path) as container, until_damage():
-        for packet in container.demux(find_video_stream(container, file.path)):
-            count += packet.size > 0
-    return dataclasses.replace(file, num_packets=count)
+    return dataclasses.replace(file, num_packets=sum(1 for _ in _packets_before_damage(file)))
 
 
 def count_shown(video: Video) -> int:
