@@ -46,7 +46,7 @@ _NUM_GROWN = 16
 # twice as many pairs as with the first one, and this many more.
 _NUM_THREADS, _NUM_AHEAD = 16, 4
 # Neighbours are at most this many images apart. They connect the images, and are only demoted if
-# their pose is wrong.
+# their pose is wrong, or if the mapper fails with them in a trial, see `demote_failing_starts`.
 NEIGHBOURS = 2
 # About this many inliers decide as well as all of them.
 _NUM_SOME = 64

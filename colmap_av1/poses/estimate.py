@@ -169,6 +169,8 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
     def run_with_links(found: _ToMend) -> Run:
         return _with_all_links(run) if found.apart else run
 
+    # The caches hold only the last result, because estimates are large. A resumed run whose
+    # decisions are stored makes only the final estimate.
     @lru_cache(maxsize=1)
     def map_key_images(found: _ToMend) -> _Mapped:
         return _map_key_images(run_with_links(found), videos, image_set, doubted=found.doubted)

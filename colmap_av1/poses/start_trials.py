@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.matching.image_matches import MatchedImages
@@ -122,12 +123,20 @@ def _without_failing_starts(
         if failed is None:
             return found
         is_in = np.isin(matched.pairs, [names.index(name) for name in failed]).all(axis=1)
-        is_in &= are_far(matched.pairs)
-        geometries = [
-            demoted(geometry) if demote else geometry
-            for geometry, demote in zip(found.geometries, is_in.tolist(), strict=True)
-        ]
-        if all(new is old for new, old in zip(geometries, found.geometries, strict=True)):
+        # Neighbours connect the images, so they are demoted only if nothing else is left.
+        changed = _demoted(found, is_in & are_far(matched.pairs)) or _demoted(found, is_in)
+        if changed is None:
             break  # the next trial would be the same
-        found = replace(found, geometries=geometries)
+        found = changed
     return matched
+
+
+def _demoted(matched: MatchedImages, which: NDArray[np.bool_]) -> MatchedImages | None:
+    """The images with demoted pairs, bool [num_pairs]; None if they were demoted before."""
+    geometries = [
+        demoted(geometry) if demote else geometry
+        for geometry, demote in zip(matched.geometries, which.tolist(), strict=True)
+    ]
+    if all(new is old for new, old in zip(geometries, matched.geometries, strict=True)):
+        return None
+    return replace(matched, geometries=geometries)

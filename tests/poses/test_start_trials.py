@@ -26,7 +26,6 @@ from colmap_av1.util.run_context import RunContext
 CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
 NUM_IMAGES = 16
 NAMES = [f"{number:02}.jpg" for number in range(NUM_IMAGES)]
-MOVING = (2, 7, 13)
 
 
 @pytest.fixture(scope="module")
@@ -36,16 +35,17 @@ def scene() -> MatchedImages:
     return MatchedImages(**rows, forward_motion=False)
 
 
-@pytest.fixture(scope="module")
-def with_moving_object(scene: MatchedImages) -> MatchedImages:
+@pytest.fixture(scope="module", params=[(2, 7, 13), (6, 7, 8)], ids=["far", "neighbours"])
+def with_moving_object(scene: MatchedImages, request: pytest.FixtureRequest) -> MatchedImages:
     """The images, three of which show a large object that moves relative to the scene."""
+    moving = request.param
     rng = np.random.default_rng(0)
     count = 2000
     points = rng.uniform((-3, -2, -2), (3, 2, 2), (count, 3))
     keypoints = list(scene.keypoints)
     first_track = 1 + max(int(own.track.max()) for own in keypoints)
     seen = []
-    for image, angle, depth in zip(MOVING, (0, 20, 42), (9, 10, 12), strict=True):
+    for image, angle, depth in zip(moving, (0, 20, 42), (9, 10, 12), strict=True):
         turn = Rotation.from_euler("y", angle, degrees=True).as_matrix()
         xy = CAMERA.img_from_cam(points @ turn.T + [0, 0, depth]) + rng.normal(0, 0.3, (count, 2))
         track = first_track + np.arange(count)
@@ -59,8 +59,8 @@ def with_moving_object(scene: MatchedImages) -> MatchedImages:
     pairs = np.array([[0, 1], [0, 2], [1, 2]], np.int32)
     matches = np.column_stack([np.arange(count)] * 2).astype(np.uint32)
     geometries = verify_pairs(seen, pairs, [matches] * 3, CAMERA)
-    of_images = np.array(MOVING)[pairs]
-    is_moving = np.isin(scene.pairs, MOVING).all(axis=1)
+    of_images = np.array(moving)[pairs]
+    is_moving = np.isin(scene.pairs, moving).all(axis=1)
     others = np.flatnonzero(~is_moving).tolist()
     first = np.array([len(own.xy) for own in scene.keypoints])[of_images]
     return replace(
