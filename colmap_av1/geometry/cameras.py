@@ -66,8 +66,7 @@ def make_camera(
         name = square if is_square(pixel_aspect) else DEFAULT_MODEL_OF_OBLONG_PIXELS
     is_known = focal_length is not None or options.camera_params is not None
     if focal_length is None:
-        share = _INITIAL_FISHEYE_SHARE if is_fisheye(name) else _INITIAL_SHARE
-        focal_length = share * max(width * pixel_aspect, height)
+        focal_length = _initial_share(name) * max(width * pixel_aspect, height)
     camera = camera_of_model(name, focal_length, width, height)
     if has_two_focal_lengths(camera):
         params = camera.params
@@ -77,6 +76,11 @@ def make_camera(
     if options.camera_params is not None:
         camera.params = parse_camera_params(options.camera_params, camera)
     return camera
+
+
+def _initial_share(model: str) -> float:
+    """Initial focal length of a camera model, in units of the longer image side."""
+    return _INITIAL_FISHEYE_SHARE if is_fisheye(model) else _INITIAL_SHARE
 
 
 def camera_fault(camera: pycolmap.Camera) -> str | None:
@@ -114,11 +118,9 @@ def has_long_focal_length(camera: pycolmap.Camera) -> bool:
 def with_initial_intrinsics(camera: pycolmap.Camera) -> pycolmap.Camera:
     """A camera of the same model with the focal length of a new camera, and without distortion."""
     initial = copy.copy(camera)
-    share = _INITIAL_FISHEYE_SHARE if is_fisheye(camera.model_name) else _INITIAL_SHARE
+    focal_length = _initial_share(camera.model_name) * max(camera.width, camera.height)
     params = np.array(camera.params)
-    params[camera.focal_length_idxs()] *= (
-        share * max(camera.width, camera.height) / camera.mean_focal_length()
-    )
+    params[camera.focal_length_idxs()] *= focal_length / camera.mean_focal_length()
     params[camera.extra_params_idxs()] = 0.0
     initial.params = params.tolist()
     initial.has_prior_focal_length = False

@@ -37,7 +37,7 @@ from colmap_av1.poses.pose_stages import (
     with_model_first,
 )
 from colmap_av1.poses.posed_images import PosesResult
-from colmap_av1.poses.remapping import has_unlikely_focal_length, remap_stage
+from colmap_av1.poses.remapping import remap_stage
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.tracks.tracks import Tracks
@@ -351,7 +351,7 @@ def _pose_images(
         keyed=found.keyed,
         has_picture_positions=has_picture_positions,
     )
-    if _is_doubtful(run, posed):
+    if _is_doubtful(posed):
         posed = remapped_poses(run, posed, image_set, least_kept=_LEAST_KEPT)
     return replace(posed, long_range=_long_range_check(run, posed, image_set))
 
@@ -378,7 +378,7 @@ def trusted_tracks(
     return every.split_after_frames(broken.tolist()), links
 
 
-def _is_doubtful(run: Run, posed: Posed) -> bool:
+def _is_doubtful(posed: Posed) -> bool:
     """Whether the adjusted model may have a wrong focal length, or bend where links replace motion.
 
     It may bend if points connect it poorly somewhere, or if it was mapped with an assumed focal
@@ -386,11 +386,10 @@ def _is_doubtful(run: Run, posed: Posed) -> bool:
     """
     if posed.adjustment is None:
         return False
-    if has_unlikely_focal_length(run, read_posed_model(run.stages / posed.last.result.poses)):
-        return True
     matches, adjusted = posed.matches.result, posed.adjustment.result
     is_weak = adjusted.doubtful_seams or adjusted.scale_lost_seams or matches.assumes_focal_length
-    return bool((matches.links.gaps or matches.links.fast) and is_weak)
+    may_bend = (matches.links.gaps or matches.links.fast) and is_weak
+    return bool(adjusted.has_long_focal_length or may_bend)
 
 
 def remapped_poses(run: Run, posed: Posed, image_set: ImageSet, *, least_kept: float) -> Posed:

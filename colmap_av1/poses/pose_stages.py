@@ -13,6 +13,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 
 from colmap_av1.errors import ModelError
+from colmap_av1.geometry.cameras import has_long_focal_length
 from colmap_av1.geometry.colmap_model import (
     ModelImage,
     ModelPoints,
@@ -110,6 +111,8 @@ class AdjustedResult(PosesResult):
         scale_lost_seams: names of the images before and after each of `Seams.worst_scale_lost`.
         usual_scaled: see `Seams.usual_scaled`.
         seams_warning: see `Seams.disconnected_warning`.
+        has_long_focal_length: whether the focal length of a camera was refined, and is longer than
+            in most videos.
     """
 
     num_motion_points: int
@@ -118,6 +121,7 @@ class AdjustedResult(PosesResult):
     scale_lost_seams: tuple[tuple[str, str], ...]
     usual_scaled: float
     seams_warning: str | None
+    has_long_focal_length: bool
 
 
 def pose_stage(
@@ -444,6 +448,8 @@ def adjustment_stage(
             usual_scaled=seams.usual_scaled,
             # No warning about a lost scale: the model is split there, see `parts`.
             seams_warning=seams.disconnected_warning,
+            has_long_focal_length=refine
+            and any(map(has_long_focal_length, result.cameras.values())),
         )
 
     settings = (

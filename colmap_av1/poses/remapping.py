@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.errors import ModelError
-from colmap_av1.geometry.cameras import has_long_focal_length, with_initial_intrinsics
+from colmap_av1.geometry.cameras import with_initial_intrinsics
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.posed_model import (
     PosedModel,
@@ -96,7 +96,7 @@ class RemappedResult(MappedResult):
             least_kept: smallest share of the observations that must agree with it.
         """
         is_whole = self.share >= _LEAST_REGISTERED and self.kept >= least_kept
-        # Of two focal lengths that fit equally well, the first is as likely.
+        # If both focal lengths fit about equally well, the first model is kept.
         most = _CLEAR_RATIO if self.from_initial else _MAX_COST_RATIO
         return is_whole and self.new_cost <= most * self.cost
 
@@ -118,12 +118,17 @@ def remap_stage(
         adjusted: the first of these, adjusted.
     """
     name = "remapped"
+    from_initial = adjusted.result.has_long_focal_length
 
     def make(partial: Path) -> RemappedResult:
         known = read_posed_model(run.stages / adjusted.result.poses)
         tracks = tracks_of_model(known, image_set)
         with run.clock.measure("poses"):
-            found = _map_tracks(run, image_set, known, tracks)
+            start = known
+            if from_initial:
+                cameras = {i: with_initial_intrinsics(own) for i, own in known.cameras.items()}
+                start = replace(known, cameras=cameras)
+            found = _map_tracks(run, image_set, start, tracks)
         poses = found if found is not None else known
         files = [f"{name}/0.npz"]
         (partial / name).mkdir()
@@ -147,7 +152,7 @@ def remap_stage(
             kept=kept,
             cost=cost,
             new_cost=new_cost,
-            from_initial=has_unlikely_focal_length(run, known),
+            from_initial=from_initial,
         )
 
     return run_stage(
@@ -167,13 +172,6 @@ def remap_stage(
     )
 
 
-def has_unlikely_focal_length(run: Run, model: PosedModel) -> bool:
-    """Whether the refined focal length of a camera is longer than in most videos."""
-    return refines_intrinsics(run.options) and any(
-        has_long_focal_length(camera) for camera in model.cameras.values()
-    )
-
-
 def _map_tracks(
     run: Run, image_set: ImageSet, known: PosedModel, tracks: Tracks
 ) -> PosedModel | None:
@@ -183,8 +181,6 @@ def _map_tracks(
     # matrices. With essential matrices, most rendered walks came out slightly more accurate, but
     # the walk `cafe` bent, with each of four seeds: 10 % of its extent instead of 0.9 %.
     cameras = [known.cameras[image.camera_id] for image in known.images]
-    if has_unlikely_focal_length(run, known):
-        cameras = [with_initial_intrinsics(camera) for camera in cameras]
     frames = posed_images_of(known, image_set).frames
     min_matches = options.match.pairs.min_matches
     paired = pair_by_tracks(tracks, frames, lambda own: covisible_pairs(own, min_matches))

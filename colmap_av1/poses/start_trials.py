@@ -122,9 +122,9 @@ def _without_failing_starts(
         failed = failing_start(found)
         if failed is None:
             return found
-        small = [names.index(name) for name in failed]
-        is_in = np.asarray(np.isin(matched.pairs, small).all(axis=1))
-        # Neighbours connect the images, so they are demoted only if nothing else is left.
+        images = [names.index(name) for name in failed]
+        is_in = np.asarray(np.isin(matched.pairs, images).all(axis=1))
+        # Neighbours connect the images, so they are demoted only if no other pair is left.
         changed = _demoted(found, is_in & are_far(matched.pairs)) or _demoted(found, is_in)
         if changed is None:
             break  # the next trial would be the same

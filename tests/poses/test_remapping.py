@@ -98,11 +98,9 @@ def test_second_mapping_is_used_if_it_fits_at_least_as_well() -> None:
 @pytest.mark.shared
 def test_wrong_long_focal_length_is_replaced(shared: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     """The first mapping of this clip of a narrow field of view gives six times the true one."""
-    video = ffmpeg(
-        *("-i", shared / "sequences" / "kitchen_long" / "clip.av1.mp4"),
-        *("-vf", "select=between(n\\,200\\,320),crop=320:240,setpts=N/30/TB", "-r", "30"),
-        *("-c:v", "libx264", "-crf", "18", tmp_path / "clip.mp4"),
-    )
+    clip, video = shared / "sequences" / "kitchen_long" / "clip.av1.mp4", tmp_path / "clip.mp4"
+    middle = "select=between(n\\,200\\,320),crop=320:240,setpts=N/30/TB"
+    ffmpeg("-i", clip, "-vf", middle, "-r", "30", "-c:v", "libx264", "-crf", "18", video)
     report = reconstruct(video, tmp_path / "out")
     assert report.focal_lengths == pytest.approx((517, 517), rel=0.25)
 

@@ -136,7 +136,6 @@ def link_images(
                 matched,
                 cameras,
                 features,
-                images_apart=images_apart,
                 offsets=pairs.offsets,
                 verify=verify,
                 options=links,
@@ -177,7 +176,12 @@ def link_images(
             )
         raise nothing_to_match(name, pairs)
     examined = found["light"].keys() | found["full"].keys()
-    return replace(linked, report=replace(linked.report, num_images=len(examined)))
+    report = replace(
+        linked.report,
+        num_images=len(examined),
+        looked_again=searches_all(plan, image_set, matched, images_apart),
+    )
+    return replace(linked, report=report)
 
 
 def _link(
@@ -187,7 +191,6 @@ def _link(
     cameras: Sequence[pycolmap.Camera],
     features: dict[int, Features],
     *,
-    images_apart: float,
     offsets: Sequence[int],
     verify: VerifyOptions,
     options: LinkOptions,
@@ -229,7 +232,6 @@ def _link(
     merged = merge_links(matched, links, features, [*contradicted, *linked])
     report = LinkReport(
         num_images=len(plan.wanted),
-        looked_again=searches_all(plan, image_set, matched, images_apart),
         num_tried=len(tried | neighbours),
         num_links=len(links.pairs),
         num_revisits=len(loops & found),
