@@ -98,9 +98,10 @@ class MatchReport:
             observable.
         small_angles: the joint estimate shows that the mapper needs a lower limit of the
             triangulation angle to begin with a pair from which a large model grows.
-        fixed_intrinsics: the mapper should not refine focal length and distortion, because the
-            camera moves along its axis, or because the joint estimate shows that the images hardly
-            determine them. They may diverge otherwise, so that few images register.
+        fixed_intrinsics: the mapper should not refine focal length and distortion, because they
+            are known and the camera moves along its axis, or because the joint estimate shows that
+            the images hardly determine them. They may diverge otherwise, so that few images
+            register.
         links: SIFT links between images that motion does not connect.
         estimate: summary of the joint estimate of all poses that matches were verified against;
             None if they were verified pair by pair.
@@ -144,7 +145,7 @@ class MatchReport:
         return MapOptions(
             forward_motion=self.forward_motion,
             init_min_tri_angle=angle,
-            refine_intrinsics=False if self.fixed_intrinsics else None,
+            refine_intrinsics=not self.fixed_intrinsics,
         )
 
     @property
@@ -276,7 +277,8 @@ def match(
         start = prepare_start(found.matched, found.cameras, clock, known)
         # The estimate does not change the cameras of an existing database.
         is_undetermined = cameras is None and _has_assumed_focal_length(found)
-        fixed_intrinsics = start.limits == FORWARD_MOTION or is_undetermined
+        is_known_ahead = start.limits == FORWARD_MOTION and has_focal_lengths
+        fixed_intrinsics = is_known_ahead or is_undetermined
         written = start.matched
         names = images.image_set.images.names
         crash = None

@@ -521,6 +521,22 @@ def test_focal_length_that_a_short_clip_does_not_determine_is_kept(
 
 
 @pytest.mark.shared
+def test_drive_with_unknown_intrinsics_is_mapped(
+    encode: Encode, shared: Path, tmp_path: Path
+) -> None:
+    frames = sorted((shared / "sequences" / "street" / "frames").iterdir())[:20]
+    drive = encode(np.stack([cv2.imread(str(f)) for f in frames]), tmp_path / "drive.mp4")
+    report = match(tmp_path / "a.db", drive, image_path=tmp_path / "frames")
+    assert report.estimate is not None
+    assert report.focal_length == pytest.approx(707, rel=0.15)
+    options = replace(report.map_options, num_threads=1)
+    mapped = map_database(
+        tmp_path / "a.db", tmp_path / "frames", tmp_path / "models", options=options
+    )
+    assert mapped.num_registered == (20,)
+
+
+@pytest.mark.shared
 def test_forward_motion_is_detected(
     encode: Encode, clip: Path, shared: Path, tmp_path: Path
 ) -> None:
@@ -534,6 +550,9 @@ def test_forward_motion_is_detected(
     assert "--Mapper.init_min_tri_angle 4" in report.next_commands[0]
     assert "--Mapper.ba_refine_focal_length 0" in report.next_commands[0]
     assert "--forward_motion" in report.next_commands[1]
+    report = match(tmp_path / "c.db", drive)
+    assert report.forward_motion
+    assert "--Mapper.ba_refine_focal_length" not in report.next_commands[0]
 
     sideways = CameraOptions("PINHOLE", "200,200,96,64")
     report = match(tmp_path / "b.db", clip, options=MatchOptions(camera=sideways))

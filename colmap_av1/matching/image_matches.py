@@ -15,7 +15,7 @@ from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.mapper_limits import INITIAL_MAX_FORWARD_MOTION, MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
-from colmap_av1.matching.two_view_geometry import UNUSED_CONFIGS, TwoViewGeometry
+from colmap_av1.matching.two_view_geometry import UNUSED_CONFIGS, TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
@@ -163,16 +163,42 @@ def verify_images(
             seed=context.seed,
             progress=progress_in(context.progress, "verification", len(pairs)),
         )
-    return MatchedImages(keypoints, pairs, matches, geometries, _is_forward_motion(geometries))
+    each = [cameras] * len(keypoints) if isinstance(cameras, pycolmap.Camera) else cameras
+    seconds = [each[second] for second in pairs[:, 1].tolist()]
+    forward_motion = _is_forward_motion(geometries, seconds)
+    return MatchedImages(keypoints, pairs, matches, geometries, forward_motion)
 
 
-def _is_forward_motion(geometries: Sequence[TwoViewGeometry]) -> bool:
+def _is_forward_motion(
+    geometries: Sequence[TwoViewGeometry], cameras: Sequence[pycolmap.Camera]
+) -> bool:
     """Whether COLMAP's mapper would reject most pairs as initial pairs because of forward motion.
 
-    Only pairs with known intrinsics have a direction of motion.
+    Args:
+        geometries: the two-view geometries. Only those with parallax have a direction of motion.
+        cameras: the second camera of each pair.
     """
-    along_axis = [abs(float(g.tvec[2])) for g in geometries if g.tvec is not None]
+    along_axis = [
+        abs(float(translation[2]))
+        for translation in map(_translation, geometries, cameras)
+        if translation is not None
+    ]
     return bool(along_axis) and float(np.median(along_axis)) >= INITIAL_MAX_FORWARD_MOTION
+
+
+def _translation(geometry: TwoViewGeometry, camera: pycolmap.Camera) -> NDArray[np.float64] | None:
+    """Direction of the first camera from the second, float64 [3], up to its sign.
+
+    None if it is not known.
+    """
+    if geometry.tvec is not None:
+        return geometry.tvec
+    if geometry.config != TwoViewConfig.UNCALIBRATED or geometry.F is None:
+        return None
+    # The epipole in the second image is the image of the first camera.
+    epipole = np.linalg.svd(geometry.F)[0][:, -1]
+    direction = np.linalg.solve(camera.calibration_matrix(), epipole)
+    return np.asarray(direction / np.linalg.norm(direction))
 
 
 def used_pairs(matched: MatchedImages) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

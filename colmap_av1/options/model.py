@@ -104,10 +104,10 @@ class MapOptions(Options):
         below=90,
         unit="degrees",
     )
-    refine_intrinsics: bool | None = option(
-        None,
-        "refine focal length and distortion; None: unless the camera moves along its axis, where "
-        "they are not observable",
+    refine_intrinsics: bool = option(
+        True,
+        "refine focal length and distortion; turn it off if they are known and the camera moves "
+        "along its axis, where they are hardly observable",
         common=True,
     )
     seed: int = option(

@@ -135,7 +135,6 @@ def run_mapper(
 def _mapping_settings(
     database: Path, output: Path, options: MapOptions, image_path: Path | None
 ) -> dict[str, Any]:
-    refine = options.refine_intrinsics
     initial_pair = FORWARD_MOTION.options if options.forward_motion else {}
     if options.init_min_tri_angle is not None:
         initial_pair = {**initial_pair, "init_min_tri_angle": options.init_min_tri_angle}
@@ -145,7 +144,7 @@ def _mapping_settings(
         "model": str(output),
         "image_path": str(image_path) if image_path is not None else None,
         "mapper": options.mapper,
-        "refine_intrinsics": refine if refine is not None else not options.forward_motion,
+        "refine_intrinsics": options.refine_intrinsics,
         "initial_pair": initial_pair,
         "seed": options.seed,
         "num_threads": threads_or_cpus(options.num_threads),

@@ -82,13 +82,13 @@ def test_focal_length_is_estimated_unless_given() -> None:
     assert found(CameraOptions("OPENCV_FISHEYE")) is None
 
 
-def test_forward_motion_is_detected_with_known_intrinsics() -> None:
+@pytest.mark.parametrize("intrinsics", [KNOWN, CameraOptions()])
+def test_forward_motion_is_detected(intrinsics: CameraOptions) -> None:
     aside, ahead = paired(make_scene(num_frames=8).tracks), paired(approach())
 
-    def is_forward(images: PairedImages, camera: CameraOptions) -> bool:
-        of_all = make_camera(camera, WIDTH, HEIGHT)
-        return verify_images(images, of_all, VerifyOptions(), CONTEXT).forward_motion
+    def is_forward(images: PairedImages) -> bool:
+        camera = make_camera(intrinsics, WIDTH, HEIGHT)
+        return verify_images(images, camera, VerifyOptions(), CONTEXT).forward_motion
 
-    assert is_forward(ahead, KNOWN)
-    assert not is_forward(aside, KNOWN)
-    assert not is_forward(ahead, CameraOptions())
+    assert is_forward(ahead)
+    assert not is_forward(aside)

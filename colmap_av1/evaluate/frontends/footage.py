@@ -144,9 +144,7 @@ def frame_list(footage: Footage, path: Path, names: Collection[str] | None = Non
 
 
 def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOptions) -> bool:
-    """Whether the camera moves along its optical axis; False if the intrinsics are unknown."""
-    if options.camera.camera_params is None:
-        return False
+    """Whether the camera moves along its optical axis."""
     tracks, chosen = prepared.tracked.tracks, prepared.tracked.chosen
     seen = tracks.keep_frames(chosen.frames)
     camera = make_camera(options.camera, *prepared.size, prepared.pixel_aspect)
