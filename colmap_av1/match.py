@@ -45,6 +45,7 @@ from colmap_av1.options import (
     PairOptions,
     ReconstructOptions,
 )
+from colmap_av1.options.words import words_of
 from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.start_trials import demote_failing_starts
@@ -164,24 +165,22 @@ class MatchReport:
             "--image_path", images,
             "--output_path", output,
         ]
-        ours = [
-            "colmap-av1", "map",
-            "--database", database,
-            "--image_path", images,
-            "--output", output,
-        ]
         if self.forward_motion:
             mapper += FORWARD_MOTION.words
-            ours.append("--forward_motion")
         elif self.small_angles:
             mapper += SMALL_ANGLES.words
-            ours += ["--init_min_tri_angle", f"{SMALL_ANGLES.init_min_tri_angle:g}"]
         if self.fixed_intrinsics:
             mapper += [
                 "--Mapper.ba_refine_focal_length", "0",
                 "--Mapper.ba_refine_extra_params", "0",
             ]
-            ours += ["--refine_intrinsics", "0"]
+        ours = [
+            "colmap-av1", "map",
+            "--database", database,
+            "--image_path", images,
+            "--output", output,
+            *(part for word in words_of(self.map_options) for part in word.split("=")),
+        ]
         densify = [
             "colmap-av1", "densify",
             "--model", f"{output}/0",

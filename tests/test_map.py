@@ -125,9 +125,7 @@ def test_second_model_of_the_same_images_is_reported(
     assert any("again" in warning for warning in report.warnings)
 
 
-def test_intrinsics_are_kept_in_forward_motion(
-    database: Path, images: Path, tmp_path: Path
-) -> None:
+def test_intrinsics_are_kept_or_refined(database: Path, images: Path, tmp_path: Path) -> None:
     def focal_lengths(report: MapReport) -> tuple[float, float]:
         """The focal length of the database, and that of the model."""
         given = pycolmap.Database.open(copy)
@@ -137,8 +135,8 @@ def test_intrinsics_are_kept_in_forward_motion(
 
     copy = tmp_path / "copy.db"
     shutil.copyfile(database, copy)
-    forward = MapOptions(forward_motion=True)
-    given, kept = focal_lengths(map_database(database, images, tmp_path / "a", options=forward))
+    fixed = MapOptions(refine_intrinsics=False)
+    given, kept = focal_lengths(map_database(database, images, tmp_path / "a", options=fixed))
     assert kept == given
     given, refined = focal_lengths(map_database(database, images, tmp_path / "b"))
     assert refined != given

@@ -427,8 +427,9 @@ def adjustment_stage(
             with tempfile.TemporaryDirectory() as name:
                 write_model(Path(name), model.cameras, model.images, model.points)
                 registered = without_unseen_images(Path(name))
-        photos = image_set.images.names[image_set.images_of(len(image_set.videos)).start :]
-        seams = model_seams(registered, set(photos))
+        names = image_set.images.names
+        photos = names[image_set.images_of(len(image_set.videos)).start :]
+        seams = model_seams(registered, photos, names)
         # `posed_model` sorts points by their ids, which start at 1 in the order of `model`.
         result = posed_model(registered, with_points=True)
         ids = np.array(sorted(registered.points3D), np.int64)

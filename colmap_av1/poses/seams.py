@@ -15,7 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres, posed_images
-from colmap_av1.images.names import natural_order, videos_of
+from colmap_av1.images.names import natural_key, natural_order, videos_of
 
 # Points with fewer views are ignored: two views do not constrain the scale between images.
 _FEWEST_VIEWS = 3
@@ -58,7 +58,8 @@ class Seams:
 
     Attributes:
         pairs: names of the images before and after each seam, in natural order.
-        num_points: int64 [n] points with views on both sides that are at most ten images apart.
+        num_points: int64 [n] points with views on both sides that are at most ten images apart; or
+            fewer, see `_points_of_loose_stretches`.
         num_elsewhere: int64 [n] points with views on both sides, however far apart.
         num_scaled: int64 [n] points that carry the scale across: they have depth both by the views
             up to the image before the seam and by those from it on. A place that is seen again
@@ -161,12 +162,18 @@ class Seams:
         )
 
 
-def model_seams(reconstruction: pycolmap.Reconstruction, photos: Collection[str] = ()) -> Seams:
+def model_seams(
+    reconstruction: pycolmap.Reconstruction,
+    photos: Collection[str] = (),
+    all_images: Collection[str] = (),
+) -> Seams:
     """Count the points at each seam of a model, see `Seams`.
 
     Args:
         reconstruction: the model.
         photos: names of photos, which have no neighbours in time.
+        all_images: names of the images that were mapped. Those that the model lacks count in the
+            distance between two images.
     """
     images, seams = images_in_time(reconstruction)
     seams = [k for k in seams if images[k].name not in photos and images[k + 1].name not in photos]
@@ -202,12 +209,17 @@ def model_seams(reconstruction: pycolmap.Reconstruction, photos: Collection[str]
         change -= np.bincount(end[some], minlength=num_images + 1)
         return np.cumsum(change)[:num_seams]
 
+    crossing = between(views[near], views[near + 1])
+    place = _places_in_time([image.name for image in images], all_images)
+    near = near[np.diff(place[views])[near] <= _REACH]
+    soon = between(views[near], views[near + 1])
+    num_points = _points_of_loose_stretches(crossing, soon, seams, views, point)
     deep = deep_from < num_images
     before = between(deep_from[deep], np.full(np.count_nonzero(deep), num_images))
     after = between(np.zeros(np.count_nonzero(deep), np.int64), deep_to[deep] + 1)
     return Seams(
         tuple((images[k].name, images[k + 1].name) for k in seams),
-        num_points=between(views[near], views[near + 1])[seams],
+        num_points=num_points[seams],
         num_elsewhere=between(first, last)[seams],
         num_scaled=between(deep_from, deep_to + 1)[seams],
         num_deep=np.minimum(before, after)[seams],
@@ -225,6 +237,53 @@ def images_in_time(reconstruction: pycolmap.Reconstruction) -> tuple[list[ModelI
     images = [posed[names[k]] for k in natural_order(names)]
     videos = videos_of([i.camera_id for i in images], [i.name for i in images])
     return images, [k for k, (own, other) in enumerate(pairwise(videos)) if own == other]
+
+
+def _points_of_loose_stretches(
+    crossing: NDArray[np.int64],
+    soon: NDArray[np.int64],
+    seams: Sequence[int],
+    views: NDArray[np.int64],
+    point: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """The points at each seam, or those that join a stretch beside it to the model if fewer.
+
+    Where images between two parts of a video are not registered, views on either side of them count
+    as near. Both parts may be held together by such points, but not the images between the parts
+    that see none of them: those of a turn, if the camera then looks back where it came from.
+
+    Args:
+        crossing: int64 [num_images - 1] points with views on both sides of each seam that are at
+            most ten registered images apart.
+        soon: likewise, at most ten mapped images apart, registered or not.
+        seams: indices of the seams whose images are neighbours in time.
+        views: int64 [m] image of each observation.
+        point: int64 [m] its point.
+
+    Returns:
+        int64 [num_images - 1].
+    """
+    if len(seams) == 0:
+        return crossing
+    least = min(_FEW * float(np.median(crossing[seams])), _ENOUGH)
+    is_seam = np.zeros(len(crossing), np.bool_)
+    is_seam[seams] = True
+    # A stretch lies between two seams with few near points, and in one video.
+    ends = ~is_seam | (soon < least)
+    stretch = np.append(0, np.cumsum(ends))
+    pairs = np.unique(np.column_stack([point, stretch[views]]), axis=0)
+    is_shared = np.bincount(pairs[:, 0]) > 1
+    shared = pairs[is_shared[pairs[:, 0]], 1]
+    joined = np.bincount(shared, minlength=int(stretch[-1]) + 1)
+    beside = np.minimum(joined[stretch[:-1]], joined[stretch[1:]])
+    return np.where(is_seam & ends, np.minimum(crossing, beside), crossing)
+
+
+def _places_in_time(names: Sequence[str], all_images: Collection[str]) -> NDArray[np.int64]:
+    """Place of each image of a model, int64 [n], in the natural order of these and all images."""
+    everything = sorted({*names, *all_images}, key=natural_key)
+    place = {name: k for k, name in enumerate(everything)}
+    return np.array([place[name] for name in names], np.int64)
 
 
 def _seen_points(

@@ -65,6 +65,21 @@ def test_loop_closures_do_not_count_at_seams_inside_the_loop(tmp_path: Path) -> 
     assert found.tolist() == [600, *[200] * 27, 600]
 
 
+def test_stretch_without_points_of_the_parts_around_it_is_not_connected(tmp_path: Path) -> None:
+    """Two parts see the same points; the images between them, beside lost ones, hardly any."""
+    views = [[k, k + 1, k + 2] for k in range(28) for _ in range(100)]
+    write_row(tmp_path, [*views, *[[3, 4, 20, 21]] * 500, *[[4, 10, 20]] * 3], 0)
+    model = read_model(tmp_path)
+    names = sorted(image.name for image in model.images.values())
+    for image in list(model.images.values()):
+        if names.index(image.name) in {*range(5, 10), *range(15, 20)}:
+            model.deregister_frame(image.frame_id)
+    assert model_seams(model).num_points[[4, 9]].tolist() == [503, 503]
+    found = model_seams(model, all_images=names)
+    assert found.num_points[[4, 9]].tolist() == [3, 3]
+    assert found.few_points == [4, 9]
+
+
 def test_cut_is_no_weak_seam_if_a_loop_closure_joins_its_sides(tmp_path: Path) -> None:
     views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
     write_row(tmp_path, views, 20)
