@@ -176,14 +176,11 @@ def pose_stage(
 
     def make(partial: Path) -> MappedResult:
         with clock.measure("poses"):
-            # pycolmap migrates the databases that it opens to its own layout.
-            copy = partial / "mapped.db"
-            shutil.copyfile(run.output / "database.db", copy)
             for attempt in attempts:
-                database = copy
+                # pycolmap migrates the databases that it opens to its own layout.
+                database = partial / f"{attempt.mapper}.db"
+                shutil.copyfile(run.output / "database.db", database)
                 if attempt.mapper == "global" and mapping.adjust:
-                    database = partial / "few_tracks.db"
-                    shutil.copyfile(copy, database)
                     keep_start_tracks(database)
                 try:
                     found = map_with(attempt, database)
