@@ -11,7 +11,7 @@ import pycolmap
 
 from colmap_av1.check.crossings import Crossings, model_crossings
 from colmap_av1.check.model_figures import ModelFigures, model_figures
-from colmap_av1.database.reading import read_images
+from colmap_av1.database.file import open_unaltered
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.poses.long_range import LongRangeErrors, model_long_range_errors
 from colmap_av1.poses.seams import Seams, model_seams
@@ -79,7 +79,10 @@ def check_model(
     long_range = None
     if image_path is not None:
         long_range = model_long_range_errors(model, Path(image_path), progress)
-    mapped = [image.name for image in read_images(database)] if database is not None else []
+    mapped = list[str]()
+    if database is not None:
+        with open_unaltered(Path(database)) as connection:
+            mapped = [name for (name,) in connection.execute("SELECT name FROM images")]
     return ModelCheck(
         figures=model_figures(model),
         seams=model_seams(model, all_images=mapped),

@@ -121,8 +121,8 @@ class Seams:
     def _below(self, share: float, most: float = math.inf) -> list[int]:
         if len(self.num_points) == 0:
             return []
-        least = min(share * float(np.median(self.num_points)), most)
-        return [int(i) for i in np.flatnonzero(self.num_points < least)]
+        is_below = self.num_points < _share_of_median(self.num_points, share, most)
+        return [int(i) for i in np.flatnonzero(is_below)]
 
     @property
     def warning(self) -> str | None:
@@ -265,18 +265,24 @@ def _points_of_loose_stretches(
     """
     if len(seams) == 0:
         return crossing
-    least = min(_FEW * float(np.median(crossing[seams])), _ENOUGH)
+    least = _share_of_median(crossing[seams], _FEW, _ENOUGH)
     is_seam = np.zeros(len(crossing), np.bool_)
     is_seam[seams] = True
     # A stretch lies between two seams with few near points, and in one video.
     ends = ~is_seam | (soon < least)
     stretch = np.append(0, np.cumsum(ends))
-    pairs = np.unique(np.column_stack([point, stretch[views]]), axis=0)
-    is_shared = np.bincount(pairs[:, 0]) > 1
-    shared = pairs[is_shared[pairs[:, 0]], 1]
-    joined = np.bincount(shared, minlength=int(stretch[-1]) + 1)
+    num_stretches = int(stretch[-1]) + 1
+    # Each point once for each stretch that sees it.
+    seen, seen_in = np.divmod(np.unique(point * num_stretches + stretch[views]), num_stretches)
+    is_shared = (np.bincount(seen) > 1)[seen]
+    joined = np.bincount(seen_in[is_shared], minlength=num_stretches)
     beside = np.minimum(joined[stretch[:-1]], joined[stretch[1:]])
     return np.where(is_seam & ends, np.minimum(crossing, beside), crossing)
+
+
+def _share_of_median(num_points: NDArray[np.int64], share: float, most: float) -> float:
+    """A share of the median number of points of all seams, or `most` if that is less."""
+    return min(share * float(np.median(num_points)), most)
 
 
 def _places_in_time(names: Sequence[str], all_images: Collection[str]) -> NDArray[np.int64]:
