@@ -2,9 +2,7 @@
 
 Two images do not show which tracks have drifted: drifted tracks agree with some epipolar geometry,
 too. The poses of all images show it, so they are estimated as in `reconstruct`. The tracks that
-agree with them are matched: the corners used in the adjustment, and a spread selection of motion
-tracks. A few long tracks connect the images. The others only have to become points, for which three
-observations suffice. This keeps the mapper fast.
+agree with them are matched: the corners used in the adjustment, and motion tracks.
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -35,6 +34,12 @@ from colmap_av1.poses.adjusting import focal_length_errors, refines_intrinsics
 from colmap_av1.poses.estimate import Posed, estimate_poses
 from colmap_av1.poses.further_models import further_poses
 from colmap_av1.poses.long_range_stage import LongRangeResult
+from colmap_av1.poses.matched_observations import (
+    NUM_OBSERVATIONS,
+    SPANS,
+    limits_of_density,
+    matched_observations,
+)
 from colmap_av1.poses.pose_stages import AdjustedResult
 from colmap_av1.poses.posed_images import PosedImages, posed_images_of, triangulate_in
 from colmap_av1.poses.run import Run
@@ -42,7 +47,7 @@ from colmap_av1.poses.starting_pair import StartingPair, starting_pair
 from colmap_av1.poses.track_matches import at_same_place, pair_by_tracks, tracks_of_model
 from colmap_av1.poses.track_stage import VideoTracks, pose_tracks
 from colmap_av1.poses.unregistered import models_of_images, tracks_of_unregistered, within_models
-from colmap_av1.tracks.selection import select_tracks, spread_observations
+from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.texts import some_names
@@ -56,23 +61,13 @@ _LEAST_ERROR, _MEDIAN_ERRORS = 0.6, 4.0
 _POINTS = TriangulateOptions(
     max_reprojection_error=1.0, min_angle=POINT_MIN_ANGLE, max_depth_error=0.5, points="survey"
 )
-# The longest motion tracks, up to 150 per image, keep all observations.
-_WHOLE = DensityOptions(
-    preset="sparse", max_tracks_per_image=150, spacing=8.0, min_images=3, max_sigma=0.0
-)
-# The others keep three observations: the first one, and those half and all of one of these spans
-# later, in images. Pairs at such distances are matched.
-_SPANS = (2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 80, 96, 128)
-_NEAR = (1, 2, 3, 4, 5, *_SPANS[2:])
+# Pairs at these distances in images are matched.
+_NEAR = (1, 2, 3, 4, 5, *SPANS[2:])
 _MAX_PAIRS = 16
-_NUM_KEPT = 3
-# Largest number of keypoints per image from tracks with three observations, by the density preset:
-# this share of the SIFT features of a picture, and this number. A mapper makes 7 to 12 points per
-# image from 100 SIFT features. The shares give about as many points, and somewhat more with the
-# default preset.
-_MOTION = {"sparse": (0.2, 450), "default": (0.4, 950)}
-# Number of pictures whose SIFT features are counted.
+# Number of pictures whose SIFT features are counted, and COLMAP's threshold for them. OpenCV's own
+# threshold is twice as high and finds a tenth as many in blurred pictures.
 _NUM_SAMPLED = 5
+_SIFT_CONTRAST = 0.02
 # A motion track this close to a corner, in pixels, observes the same point less accurately.
 _SAME_POINT = 1.0
 # Two tracks of one video this close to each other, in pixels, are the same.
@@ -294,7 +289,7 @@ def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, NDArr
     # Points of motion tracks come first.
     agrees &= adjusted.track >= model.adjusted.num_motion_points
     agrees &= np.isin(adjusted.frame, model.placed.frames)
-    enough = np.bincount(adjusted.track[agrees], minlength=adjusted.num_tracks) >= _NUM_KEPT
+    enough = np.bincount(adjusted.track[agrees], minlength=adjusted.num_tracks) >= NUM_OBSERVATIONS
     kept = adjusted.keep_observations(agrees & enough[adjusted.track])
     return kept, known.points.xyz[enough]
 
@@ -327,80 +322,24 @@ def _start(tracks: Tracks, points: NDArray[np.float64], placed: PosedImages) -> 
     return replace(start, points=start.points[::step])
 
 
-def _limits(run: Run, image_set: ImageSet, density: DensityOptions) -> DensityOptions:
-    """Limits of the number of motion tracks that keep three observations."""
-    most = density.max_tracks_per_image
-    if most is None:
-        most = 0
-        if density.preset in _MOTION:
-            share, limit = _MOTION[density.preset]
-            most = min(limit, round(share * _num_features(run, image_set)))
-    return replace(density, max_tracks_per_image=most, min_images=_NUM_KEPT)
-
-
 def _num_features(run: Run, image_set: ImageSet) -> float:
     """Mean number of SIFT features of a picture, estimated from a few."""
     some = evenly_spread(len(image_set.sequence), _NUM_SAMPLED)
-    sift = cv2.SIFT.create()
+    sift = cv2.SIFT.create(contrastThreshold=_SIFT_CONTRAST)
     pictures = run.pictures(image_set)(some)
     return float(np.mean([len(sift.detect(smaller_grey(own))) for _, own in pictures]))
 
 
-def _kept_observations(
+def _matched(
     agreeing: _Agreeing, frames: NDArray[np.int32], limits: DensityOptions
 ) -> NDArray[np.bool_]:
-    """Which observations are matched: three of most motion tracks, all of other tracks.
-
-    Args:
-        agreeing: the tracks.
-        frames: int32 [num_images] the frames of all images.
-        limits: limits of the number of motion tracks that keep three observations.
-
-    Returns:
-        bool [num_observations].
-    """
-    tracks = agreeing.tracks
-    kept = np.ones(tracks.num_observations, np.bool_)
-    is_motion = np.repeat(np.arange(tracks.num_tracks) >= agreeing.num_corners, tracks.lengths)
-    motion = tracks.keep_observations(is_motion)
-    if motion.num_tracks:
-        longest = spread_observations(motion, _WHOLE)
-        is_long = np.add.reduceat(longest, motion.offsets[:-1]) > 0
-        few = _first_middle_last(motion, np.searchsorted(frames, motion.frame))
-        few[np.repeat(is_long, motion.lengths)] = False
-        few[few] = spread_observations(motion.keep_observations(few), limits)
-        kept[is_motion] = longest | few
+    """Which observations are matched, see `matched_observations`."""
+    num_tracks = agreeing.tracks.num_tracks
+    is_start = np.zeros(num_tracks, np.bool_)
     if agreeing.start is not None:
-        is_whole = np.zeros(tracks.num_tracks, np.bool_)
-        is_whole[agreeing.start.points] = True
-        kept |= np.repeat(is_whole, tracks.lengths)
-    return kept
-
-
-def _first_middle_last(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Choose three observations of each track at distances at which pairs are matched.
-
-    Args:
-        tracks: tracks with three or more observations.
-        view: int64 [num_observations] index of the image of each observation.
-    """
-    first = tracks.offsets[:-1]
-    begin, end = view[first], view[tracks.offsets[1:] - 1]
-    # Three observations span two images or more.
-    span = np.array(_SPANS)[np.searchsorted(_SPANS, end - begin, side="right") - 1]
-    # Observations are sorted by track, then by image.
-    num_views = int(view.max()) + 1
-    place = tracks.track * num_views + view
-    number = np.arange(tracks.num_tracks)[:, None]
-    at = begin[:, None] + np.column_stack([0 * span, span // 2, span])
-    wanted = np.searchsorted(place, number * num_views + at)
-    there = np.take(place, wanted, mode="clip") == number * num_views + at
-    middle = first + (tracks.lengths - 1) // 2
-    ends = np.column_stack([first, middle, tracks.offsets[1:] - 1])
-    index = np.where(there.all(axis=1, keepdims=True), wanted, ends)
-    chosen = np.zeros(tracks.num_observations, np.bool_)
-    chosen[index.ravel()] = True
-    return chosen
+        is_start[agreeing.start.points] = True
+    is_corner = np.arange(num_tracks) < agreeing.num_corners
+    return matched_observations(agreeing.tracks, frames, is_corner, is_start, limits)
 
 
 def _paired(
@@ -411,11 +350,12 @@ def _paired(
     density: DensityOptions,
 ) -> PairedImages:
     """Match registered images along the tracks that agree with the poses, others along all."""
-    frames, limits = image_set.images.frames, _limits(run, image_set, density)
+    frames = image_set.images.frames
+    limits = limits_of_density(density, partial(_num_features, run, image_set))
     tracks, starts = list[Tracks](), list[StartingPair]()
     num_tracks = 0
     for own in agreeing:
-        kept = _kept_observations(own, frames, limits)
+        kept = _matched(own, frames, limits)
         tracks.append(own.tracks.keep_observations(kept))
         if own.start is not None:
             # Tracks without a kept observation are gone, which changes the numbers of the others.
