@@ -21,10 +21,10 @@ from colmap_av1.util.spread import evenly_spread
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
 
-# Points are thinned in evenly spread key images: at least 32, at most 128, in between every 6th
-# image. Holes are filled in at most _WHOLE_IMAGES key images.
+# Points are thinned in evenly spread images: at least 32, at most 128, in between every 6th image.
+# Holes are filled in at most _FILLED_IMAGES images, which are evenly spread, too.
 _EVEN_IMAGES = (32, 128, 6)
-_WHOLE_IMAGES = 128
+_FILLED_IMAGES = 128
 # Widths in pixels of the image cells that should contain one point each, from coarse to fine.
 # Closer points cost training time and prevent the trainer from placing its own.
 _SPACINGS = (32, 16, 8)
@@ -44,8 +44,8 @@ _ROUNDS = 2
 _FARTHER = 0.75
 _TOO_NEAR = 2.0
 _NEAREST = 8
-# An added point must not be nearer, by more than a factor, than the surfaces of neighbouring key
-# images. Multiples of the surrounding depth are tried in turn, then the largest depth.
+# An added point must not be nearer, by more than a factor, than the surfaces of neighbouring
+# filled images. Multiples of the surrounding depth are tried in turn, then the largest depth.
 _HIDES = 1.25
 _PUSHED = (1.0, 1.5, 3.0)
 _BESIDE = 2
@@ -73,23 +73,23 @@ def splat_cloud(
     fewest, most, step = _EVEN_IMAGES
     even = evenly_spread(len(images), min(max(len(images) // step, fewest), most))
     stage = _stages(points, [images[i] for i in even])
-    keys = evenly_spread(len(images), _WHOLE_IMAGES)
+    places = evenly_spread(len(images), _FILLED_IMAGES)
     # Shuffle within a stage: a limit would otherwise drop points at the end of the video.
     shuffled = np.random.default_rng(0).permutation(len(stage))
     order = np.lexsort((shuffled, stage))[: int((stage < len(_SPACINGS)).sum())]
     if max_points is None:
         kept = take_points(points, np.sort(order))
-        return joined_points([kept, _filling(kept, images, keys)])
+        return joined_points([kept, _filling(kept, images, places)])
     # Filling holes has priority over detail, but needs surfaces that determine their depth.
     kept = take_points(points, order[: round(_FOR_SURFACES * max_points)])
-    filled = _filling(kept, images, keys)
+    filled = _filling(kept, images, places)
     filled = take_points(filled, np.arange(min(len(filled.xyz), max_points - len(kept.xyz))))
     kept = take_points(points, np.sort(order[: max_points - len(filled.xyz)]))
     return joined_points([kept, filled])
 
 
-def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:
-    """Index of the widest spacing at which each point is kept in a key image, int64 [n].
+def _stages(points: ModelPoints, images: Sequence[PosedCamera]) -> _Ints:
+    """Index of the widest spacing at which each point is kept in one of the images, int64 [n].
 
     Points that are not kept at any spacing get the number of spacings.
     """
@@ -98,14 +98,14 @@ def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:
     rank = np.empty(len(first), np.int64)
     rank[first] = np.arange(len(first))
     stage = np.full(len(rank), len(_SPACINGS))
-    for key in keys:
-        index, xy, depth = key.project(points.xyz)
+    for image in images:
+        index, xy, depth = image.project(points.xyz)
         best = _core.best_at_spacings(
             xy,
             depth,
             rank[index],
-            width=key.size[0],
-            height=key.size[1],
+            width=image.size[0],
+            height=image.size[1],
             spacings=np.array(_SPACINGS),
             steps_per_octave=_STEPS_PER_OCTAVE,
             most_steps=_MOST_STEPS,
@@ -114,35 +114,35 @@ def _stages(points: ModelPoints, keys: Sequence[PosedCamera]) -> _Ints:
     return stage
 
 
-def _filling(kept: ModelPoints, images: Sequence[PosedCamera], keys: list[int]) -> ModelPoints:
-    """Points that fill the holes of the key images, one point of each cell first."""
-    nearest = [nearest_depth(images[key], kept.xyz) for key in keys]
+def _filling(kept: ModelPoints, images: Sequence[PosedCamera], places: list[int]) -> ModelPoints:
+    """Points that fill the holes of the images at `places`, one point of each cell first."""
+    nearest = [nearest_depth(images[place], kept.xyz) for place in places]
     surfaces = [without_gaps(grid) for grid in nearest]
     usual = _usual_depth(surfaces)
     filled: list[ModelPoints] = [take_points(kept, np.empty(0, np.int64))]
     is_first = [np.empty(0, np.bool_)]
     added = np.empty((0, 3))
-    for place in _spread_order(len(keys)) * _ROUNDS:
-        own = images[keys[place]]
-        grid = without_gaps(np.minimum(nearest[place], nearest_depth(own, added)))
+    for number in _spread_order(len(places)) * _ROUNDS:
+        own = images[places[number]]
+        grid = without_gaps(np.minimum(nearest[number], nearest_depth(own, added)))
         rows, columns = np.nonzero(np.isinf(grid) & own.counting_cells)
         if len(rows) == 0:
             continue
         depth = _depth_of_holes(grid, usual)
         xy, cell, first = _squares(own, rows, columns)
         is_first.append(first)
-        beside = range(max(place - _BESIDE, 0), min(place + _BESIDE + 1, len(keys)))
+        beside = range(max(number - _BESIDE, 0), min(number + _BESIDE + 1, len(places)))
         xyz = _behind(
             own,
             xy,
             depth[rows, columns][cell],
             float(depth.max()),
-            [(images[keys[i]], surfaces[i]) for i in beside if i != place],
+            [(images[places[i]], surfaces[i]) for i in beside if i != number],
         )
         added = np.concatenate([added, xyz])
-        around = (keys[place] - 1, keys[place], keys[place] + 1)
+        around = (places[number] - 1, places[number], places[number] + 1)
         there = [i for i in around if 0 <= i < len(images)]
-        filled.append(_with_observations(xyz, images, there, keys[place]))
+        filled.append(_with_observations(xyz, images, there, places[number]))
     order = np.argsort(~np.concatenate(is_first), kind="stable")
     return take_points(joined_points(filled), order)
 
