@@ -28,18 +28,17 @@ _FEW = 0.07
 _REACH = 10
 # This many points are never few, however many other seams have: bent models had at most 50.
 _ENOUGH = 100
-# A seam with few points is not disconnected if images before and after it share at least this share
-# of the median number of points, however far apart they are: the parts of a cut video may see the
-# same place elsewhere.
+# A seam with few points is not disconnected if this share of the median number of points have views
+# before and after it, however far apart: the parts of a cut video may see the same place elsewhere.
 _ELSEWHERE = 0.5
 # A point has depth if its parallax exceeds this many pixels, several times the error of an
 # observation.
 _LEAST_PARALLAX = 2.0
-# The scale of a model is lost at a seam that less than this share of the usual number of points
-# carry it across, although _DEEP points have depth on either side. This happens where the camera
-# turns on the spot by its field of view: bent models of rendered walks had at most 6 %, which was
-# 32 points, correct ones at least 9 %. With _SCALED points it is not lost, however many others
-# have: a correct model of a walk through a café had 44 of 730.
+# The scale of a model is lost at a seam if fewer points than this share of the usual number carry
+# it across, although more than _DEEP points have depth on either side. This happens where the
+# camera turns on the spot by its field of view: bent models of rendered walks had at most 6 %,
+# which was 32 points, correct ones at least 9 %. With _SCALED points it is not lost, however many
+# others have: a correct model of a walk through a café had 44 of 730.
 _LOST = 0.07
 _SCALED = 40
 _DEEP = 100
@@ -58,14 +57,14 @@ class Seams:
 
     Attributes:
         pairs: names of the images before and after each seam, in natural order.
-        num_points: int64 [n] points with views on both sides that are at most ten images apart; or
-            fewer, see `_points_of_loose_stretches`.
+        num_points: int64 [n] points with views on both sides, of the same video and at most ten
+            images apart; or fewer, see `_points_of_loose_stretches`.
         num_elsewhere: int64 [n] points with views on both sides, however far apart.
-        num_scaled: int64 [n] points that carry the scale across: they have depth both by the views
-            up to the image before the seam and by those from it on. A place that is seen again
-            more than ten images later counts as another point.
-        num_deep: int64 [n] points that have depth by the views up to the image before the seam, or
-            by those from it on, whichever are fewer.
+        num_scaled: int64 [n] points that carry the scale across. With k the image before the seam,
+            they have depth both by the views of the video up to k and by those from k on. A place
+            that is seen again more than ten images later counts as another point.
+        num_deep: int64 [n] points that have depth by the views of the video up to k, or by those
+            from k on, whichever are fewer.
     """
 
     pairs: tuple[tuple[str, str], ...]
@@ -106,10 +105,10 @@ class Seams:
 
     @property
     def worst_scale_lost(self) -> list[int]:
-        """Index of the worst seam in every run of consecutive seams that lose the scale."""
+        """Indices of the worst seam in every run of consecutive seams that lose the scale."""
         runs: list[list[int]] = []
         for seam in self.scale_lost:
-            if runs and runs[-1][-1] == seam - 1:
+            if runs and self._are_consecutive(runs[-1][-1], seam):
                 runs[-1].append(seam)
             else:
                 runs.append([seam])
@@ -117,6 +116,10 @@ class Seams:
             min(run, key=lambda i: (int(self.num_scaled[i]), abs(2 * i - run[0] - run[-1])))
             for run in runs
         ]
+
+    def _are_consecutive(self, seam: int, other: int) -> bool:
+        """Whether the image after a seam is the one before the other seam."""
+        return self.pairs[seam][1] == self.pairs[other][0]
 
     def _below(self, share: float, most: float = math.inf) -> list[int]:
         if len(self.num_points) == 0:
@@ -151,11 +154,12 @@ class Seams:
         if not self.scale_lost:
             return None
         first = last = self.scale_lost[0]
-        while last + 1 in self.scale_lost:
+        while last + 1 in self.scale_lost and self._are_consecutive(last, last + 1):
             last += 1
         more = self.scale_lost[-1] > last
         return (
-            f"no points carry the scale from '{self.pairs[first][0]}' to '{self.pairs[last][1]}'"
+            f"hardly any points carry the scale from '{self.pairs[first][0]}' to "
+            f"'{self.pairs[last][1]}'"
             f"{', and elsewhere' if more else ''}: the camera turns there without moving sideways, "
             "so the parts before and after may differ in scale; keep walking while you turn, or "
             "reconstruct the two parts separately"
@@ -181,7 +185,10 @@ def model_seams(
     num_images, num_seams = len(images), max(len(images) - 1, 0)
     order = np.lexsort((views, point))
     views, point = views[order], point[order]
-    near = np.flatnonzero((np.diff(point) == 0) & (np.diff(views) <= _REACH))
+    is_seam = np.isin(np.arange(num_seams), seams)
+    sequence = np.cumsum(np.append(True, ~is_seam)) if num_images else np.empty(0, np.int64)
+    is_near = (np.diff(point) == 0) & (np.diff(views) <= _REACH)
+    near = np.flatnonzero(is_near & (np.diff(sequence[views]) == 0))
     first, last = (np.full(len(xyz), fill) for fill in (num_images, -1))
     np.minimum.at(first, point, views)
     np.maximum.at(last, point, views)
@@ -215,8 +222,9 @@ def model_seams(
     soon = between(views[near], views[near + 1])
     num_points = _points_of_loose_stretches(crossing, soon, seams, views, point)
     deep = deep_from < num_images
-    before = between(deep_from[deep], np.full(np.count_nonzero(deep), num_images))
-    after = between(np.zeros(np.count_nonzero(deep), np.int64), deep_to[deep] + 1)
+    of_visit = sequence[begin[deep]]
+    before = between(deep_from[deep], np.searchsorted(sequence, of_visit, side="right"))
+    after = between(np.searchsorted(sequence, of_visit), deep_to[deep] + 1)
     return Seams(
         tuple((images[k].name, images[k + 1].name) for k in seams),
         num_points=num_points[seams],

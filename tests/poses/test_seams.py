@@ -240,6 +240,21 @@ def test_turn_wider_than_the_field_of_view_loses_the_scale(tmp_path: Path) -> No
     assert "scale" in seams.warning
 
 
+def test_scale_is_not_lost_where_another_video_begins(tmp_path: Path) -> None:
+    """The first image of a video alone gives no point depth."""
+    _walk_with_a_turn(tmp_path, degrees=80, aside=1)
+    model = read_model(tmp_path)
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    for k, image in enumerate(images[22:]):
+        image.name = f"a/{k:02}.png"
+    for k, image in enumerate(images[:22]):
+        image.name = f"b/{k:02}.png"
+    seams = model_seams(model)
+    assert ("b/00.png", "b/01.png") in seams.pairs
+    assert seams.scale_lost == []
+    assert seams.warning is None
+
+
 @pytest.mark.parametrize(
     ("usual", "fewest", "is_lost"), [(730, 44, False), (730, 20, True), (468, 26, True)]
 )
