@@ -2,7 +2,7 @@
 
 Two images do not show which tracks have drifted: drifted tracks agree with some epipolar geometry,
 too. The poses of all images show it, so they are estimated as in `reconstruct`. The tracks that
-agree with them are matched: the corners used in the adjustment, and motion tracks.
+agree with them are matched: the corners and SIFT links used in the adjustment, and motion tracks.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ def _agreeing_tracks(
     corners, corner_points = corners.keep_tracks(~repeated), corner_points[~repeated]
     every = model.tracks
     every = every.keep_tracks(~at_same_place(every, others, _SAME_TRACK))
-    # `_kept_observations` applies the limit per image, which depends on what each track keeps.
+    # `matched_observations` applies the limit per image, which depends on what each track keeps.
     some = select_tracks(every, replace(density, max_tracks_per_image=0))
     some = some.keep_tracks(~at_same_place(some, corners, _SAME_POINT))
     motion, motion_points = _agreeing_motion(run, some, placed)

@@ -24,14 +24,25 @@ def spread(spans: list[list[int]]) -> Tracks:
     return replace(tracks, width=1000, height=1000, xy=np.repeat(at, tracks.lengths, axis=0))
 
 
+def matched(
+    tracks: Tracks,
+    *,
+    corners: bool = False,
+    needed: tuple[int, ...] = (),
+    limits: DensityOptions = UNLIMITED,
+) -> list[list[int]]:
+    """The images in which each track is matched."""
+    is_corner = np.full(tracks.num_tracks, corners)
+    is_needed = np.isin(np.arange(tracks.num_tracks), needed)
+    kept = matched_observations(tracks, FRAMES, is_corner, is_needed, limits)
+    return [tracks.frame[kept & (tracks.track == t)].tolist() for t in range(tracks.num_tracks)]
+
+
 def num_matched(
-    tracks: Tracks, *, corners: bool = False, whole: tuple[int, ...] = ()
+    tracks: Tracks, *, corners: bool = False, needed: tuple[int, ...] = ()
 ) -> NDArray[np.int64]:
     """Number of matched observations of each track."""
-    is_corner = np.full(tracks.num_tracks, corners)
-    is_whole = np.isin(np.arange(tracks.num_tracks), whole)
-    kept = matched_observations(tracks, FRAMES, is_corner, is_whole, UNLIMITED)
-    return np.bincount(tracks.track[kept], minlength=tracks.num_tracks)
+    return np.array([len(own) for own in matched(tracks, corners=corners, needed=needed)])
 
 
 @pytest.mark.parametrize("corners", [False, True])
@@ -58,7 +69,26 @@ def test_corners_of_places_seen_again_keep_all_observations() -> None:
 def test_given_tracks_keep_all_observations() -> None:
     tracks = spread([list(range(40))] * 600)
     few = np.flatnonzero(num_matched(tracks) == 3)[:5]
-    assert num_matched(tracks, whole=tuple(few.tolist()))[few].tolist() == [40] * 5
+    assert num_matched(tracks, needed=tuple(few.tolist()))[few].tolist() == [40] * 5
+
+
+def test_three_observations_cover_all_images_of_the_tracks() -> None:
+    three = [own for own in matched(spread([list(range(64))] * 600)) if len(own) == 3]
+    assert {tuple(np.diff(own).tolist()) for own in three} == {(24, 24)}
+    assert {own[0] for own in three} == {0, 15}
+
+
+def test_three_observations_avoid_missing_ones() -> None:
+    """Images at distances that are not matched would not be connected."""
+    seen = [*range(12), *range(13, 25)]
+    three = [own for own in matched(spread([seen] * 600)) if len(own) == 3]
+    assert {tuple(np.diff(own).tolist()) for own in three} <= {(10, 10), (8, 8)}
+
+
+def test_tracks_with_three_observations_are_limited() -> None:
+    limits = replace(UNLIMITED, max_tracks_per_image=50)
+    counts = np.array([len(own) for own in matched(spread([[0, 5, 10]] * 600), limits=limits)])
+    assert 100 < np.count_nonzero(counts) <= 200
 
 
 @pytest.mark.parametrize(("preset", "most"), [("sparse", 140), ("default", 280), ("dense", 0)])
@@ -66,4 +96,5 @@ def test_number_of_tracks_depends_on_the_features_of_the_pictures(preset: str, m
     limits = limits_of_density(DensityOptions(preset=preset), lambda: 1000.0)
     assert limits.max_tracks_per_image == most
     given = DensityOptions(preset=preset, max_tracks_per_image=77)
+    assert limits_of_density(DensityOptions(preset="default"), lambda: 1.0).max_tracks_per_image
     assert limits_of_density(given, lambda: 1000.0).max_tracks_per_image == 77
