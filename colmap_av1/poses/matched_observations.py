@@ -32,7 +32,7 @@ NUM_OBSERVATIONS = 3
 # of the number of SIFT features of a picture, and to the number. With the default preset, a mapper
 # makes at least 1.2 times as many points as from SIFT in most videos: SIFT gives 3 to 8 points per
 # image from 100 features.
-_LIMITS = {"sparse": (0.14, 500), "default": (0.28, 1050)}
+_LIMITS = {"sparse": (0.14, 500), "default": (0.28, 1000)}
 
 
 def matched_observations(
