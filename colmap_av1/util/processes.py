@@ -14,6 +14,7 @@ _SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
 _BOUND = """
 import ctypes, os, signal, sys
 starter, *command = sys.argv[1:]
+signal.pthread_sigmask(signal.SIG_SETMASK, [])  # signals may be blocked while a process starts
 ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 if os.getppid() == int(starter):
     os.execvp(command[0], command)

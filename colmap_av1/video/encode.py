@@ -28,6 +28,7 @@ from colmap_av1.options import EncodeOptions
 from colmap_av1.util.files import check_new_file, may_read, remove_leftovers, whole_file
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.util.signals import held_back
 from colmap_av1.video.coded_size import scaling
 from colmap_av1.video.container import VideoFile, open_stream, read_file
 from colmap_av1.video.deinterlacing import DEINTERLACING
@@ -289,21 +290,26 @@ def _run(command: Sequence[str], video: VideoFile, report: Callable[[int], None]
 @contextmanager
 def _process(command: Sequence[str], log_file: object) -> Iterator[subprocess.Popen[str]]:
     """Run ffmpeg; it is killed if the body ends before it does."""
-    process = subprocess.Popen(
-        bound(command),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=log_file,  # type: ignore[call-overload]
-        text=True,
-    )
+    process: subprocess.Popen[str] | None = None
     try:
+        # An interrupt while it starts must not leave it running: it would write its output after
+        # the output was removed.
+        with held_back():
+            process = subprocess.Popen(
+                bound(command),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=log_file,  # type: ignore[call-overload]
+                text=True,
+            )
         yield process
     finally:
-        if process.poll() is None:
-            process.kill()
-        process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
+        if process is not None:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
 
 
 def _readable_frames(video: VideoFile, count: int, strict: bool) -> int:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from colmap_av1.util.signals import ending_in_order
+from colmap_av1.util.signals import ending_in_order, held_back, let_through
 
 # Shells start background processes with interrupts ignored, and nohup with hang-ups ignored. Child
 # processes inherit this.
@@ -129,3 +129,24 @@ def test_signal_handlers_are_not_changed_in_other_threads() -> None:
     thread.start()
     thread.join()
     assert within == [signal.getsignal(signal.SIGTERM)]
+
+
+def test_signal_that_another_thread_receives_is_held_back() -> None:
+    """A process that starts during an interrupt would not be known, and left running."""
+    steps = []
+
+    def receive() -> None:
+        let_through()
+        signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+        steps.append("received")
+
+    def body() -> None:
+        with held_back():
+            thread = threading.Thread(target=receive)
+            thread.start()
+            thread.join()
+            steps.append("done")
+
+    with ending_in_order(), pytest.raises(KeyboardInterrupt):
+        body()
+    assert steps == ["received", "done"]
