@@ -64,8 +64,8 @@ _POINTS = TriangulateOptions(
 # Pairs at these distances in images are matched.
 _NEAR = (1, 2, 3, 4, 5, *SPANS[2:])
 _MAX_PAIRS = 16
-# Number of pictures whose SIFT features are counted, and COLMAP's threshold for them. OpenCV's own
-# threshold is twice as high and finds a tenth as many in blurred pictures.
+# Number of pictures whose SIFT features are counted, and COLMAP's threshold for them. With OpenCV's
+# own threshold, which is twice as high, pictures of low contrast have far fewer features.
 _NUM_SAMPLED = 5
 _SIFT_CONTRAST = 0.02
 # A motion track this close to a corner, in pixels, observes the same point less accurately.

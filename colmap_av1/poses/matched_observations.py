@@ -24,14 +24,14 @@ _LONGEST = DensityOptions(
 # Corners with at most _SHORT observations keep all of them, because they connect images where the
 # camera moves fast. So do corners that are seen again after more than _REVISITED images.
 _SHORT, _REVISITED = 8, 10
-# Of other tracks, three observations are matched: two that are one of these spans apart, in images,
-# and the one in the middle. Pairs at such distances are matched.
+# All other tracks have three matched observations: two that are one of these numbers of images
+# apart, and the one in the middle. Pairs of images at such distances are matched.
 SPANS = (2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 80, 96, 128)
 NUM_OBSERVATIONS = 3
-# The number of keypoints per image from such tracks is limited, by the density preset, to the share
-# of the number of SIFT features of a picture, and to the number. With the default preset, a mapper
-# makes at least 1.2 times as many points as from SIFT in most videos: SIFT gives 3 to 8 points per
-# image from 100 features.
+# Each density preset limits the number of keypoints per image from such tracks to a share of the
+# number of SIFT features of a picture, and to a fixed number. With the default preset, a mapper
+# makes at least 1.2 times as many points as from SIFT in most videos: 100 SIFT features of an image
+# give 3 to 8 points.
 _LIMITS = {"sparse": (0.14, 500), "default": (0.28, 1000)}
 
 
@@ -44,8 +44,8 @@ def matched_observations(
 ) -> NDArray[np.bool_]:
     """Choose the observations that are matched.
 
-    Few tracks keep all observations. Of the others, three observations are matched, until enough
-    tracks are matched in every image.
+    A few tracks keep all observations. The other tracks get three matched observations each, the
+    best tracks first, until every image has enough of them.
 
     Args:
         tracks: tracks with three or more observations.

@@ -220,7 +220,7 @@ def model_seams(
     place = _places_in_time([image.name for image in images], all_images)
     near = near[np.diff(place[views])[near] <= _REACH]
     soon = between(views[near], views[near + 1])
-    num_points = _points_of_loose_stretches(crossing, soon, seams, views, point)
+    num_points = _points_of_loose_stretches(crossing, soon, is_seam, views, point)
     deep = deep_from < num_images
     of_visit = sequence[begin[deep]]
     before = between(deep_from[deep], np.searchsorted(sequence, of_visit, side="right"))
@@ -250,7 +250,7 @@ def images_in_time(reconstruction: pycolmap.Reconstruction) -> tuple[list[ModelI
 def _points_of_loose_stretches(
     crossing: NDArray[np.int64],
     soon: NDArray[np.int64],
-    seams: Sequence[int],
+    is_seam: NDArray[np.bool_],
     views: NDArray[np.int64],
     point: NDArray[np.int64],
 ) -> NDArray[np.int64]:
@@ -264,18 +264,16 @@ def _points_of_loose_stretches(
         crossing: int64 [num_images - 1] points with views on both sides of each seam that are at
             most ten registered images apart.
         soon: likewise, at most ten mapped images apart, registered or not.
-        seams: indices of the seams whose images are neighbours in time.
+        is_seam: bool [num_images - 1] whether the images of a seam are neighbours in time.
         views: int64 [m] image of each observation.
         point: int64 [m] its point.
 
     Returns:
         int64 [num_images - 1].
     """
-    if len(seams) == 0:
+    if not is_seam.any():
         return crossing
-    least = _share_of_median(crossing[seams], _FEW, _ENOUGH)
-    is_seam = np.zeros(len(crossing), np.bool_)
-    is_seam[seams] = True
+    least = _share_of_median(crossing[is_seam], _FEW, _ENOUGH)
     # A stretch lies between two seams with few near points, and in one video.
     ends = ~is_seam | (soon < least)
     stretch = np.append(0, np.cumsum(ends))

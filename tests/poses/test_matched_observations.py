@@ -96,5 +96,9 @@ def test_number_of_tracks_depends_on_the_features_of_the_pictures(preset: str, m
     limits = limits_of_density(DensityOptions(preset=preset), lambda: 1000.0)
     assert limits.max_tracks_per_image == most
     given = DensityOptions(preset=preset, max_tracks_per_image=77)
-    assert limits_of_density(DensityOptions(preset="default"), lambda: 1.0).max_tracks_per_image
     assert limits_of_density(given, lambda: 1000.0).max_tracks_per_image == 77
+
+
+def test_pictures_without_features_do_not_remove_the_limit() -> None:
+    """A limit of 0 would be none."""
+    assert limits_of_density(DensityOptions(preset="default"), lambda: 1.0).max_tracks_per_image
