@@ -16,8 +16,11 @@ from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
+    INITIAL_MAX_FORWARD_MOTION,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
+    LOWER_INITIAL_LIMITS,
+    LOWEST_INITIAL_LIMITS,
     SMALL_ANGLES,
     InitialLimits,
 )
@@ -72,12 +75,27 @@ class PreparedStart:
         limits: the limits of the initial pair that the mapper needs.
         is_certain: a pair certainly meets these limits. If not, the mapper may have to lower them.
         may_meet_defaults: a pair with a known pose may meet the default limits.
+        lowered: how the mapper begins if no pair meets the default limits; None if it is not known.
     """
 
     matched: MatchedImages
     limits: InitialLimits
     is_certain: bool
     may_meet_defaults: bool
+    lowered: LoweredStart | None = None
+
+
+@dataclass(frozen=True)
+class LoweredStart:
+    """How the mapper probably begins if no pair meets its default limits.
+
+    Attributes:
+        options: the lower limits, by the names of the mapper's options.
+        first_image: index of an image of the initial pair.
+    """
+
+    options: dict[str, float]
+    first_image: int
 
 
 def prepare_start(
@@ -140,10 +158,14 @@ def prepare_start(
         geometries = list(matched.geometries)
         for k in demote:
             geometries[k] = demoted(geometries[k])
-    remaining = found.possible(DEFAULT_LIMITS) & found.is_known
-    remaining[list(demote)] = False
+    found.count[list(demote)] = np.minimum(found.count[list(demote)], _MIN_INLIERS - 1)
+    may_meet_defaults = bool((found.possible(DEFAULT_LIMITS) & found.is_known).any())
     return PreparedStart(
-        replace(matched, geometries=geometries), limits, is_certain, bool(remaining.any())
+        replace(matched, geometries=geometries),
+        limits,
+        is_certain,
+        may_meet_defaults,
+        found.lowered_start(matched.pairs),
     )
 
 
@@ -225,6 +247,32 @@ class _Candidates:
         is_possible &= self.angle >= _WIDE_SHARE * limits.init_min_tri_angle
         return is_possible & (self.along < limits.init_max_forward_motion + _ALONG_MARGIN)
 
+    def lowered_start(self, pairs: NDArray[np.int32]) -> LoweredStart | None:
+        """How the mapper begins if no pair meets the default limits.
+
+        Args:
+            pairs: int32 [num_pairs, 2] indices of images.
+        """
+        rank_of = _image_ranks(pairs, self.count)
+        for options in (LOWER_INITIAL_LIMITS, LOWEST_INITIAL_LIMITS):
+            meets = self.count >= options["init_min_num_inliers"]
+            meets &= self.angle >= options["init_min_tri_angle"]
+            own = pairs[meets & (self.along < INITIAL_MAX_FORWARD_MOTION)].ravel()
+            if len(own) > 0:
+                return LoweredStart(options, int(own[rank_of[own].argmin()]))
+        return None
+
+
+def _image_ranks(pairs: NDArray[np.int32], count: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The rank of each image, int64 [num_images]: the mapper tries those with most matches first.
+
+    Args:
+        pairs: int32 [num_pairs, 2] indices of images.
+        count: int64 [num_pairs] number of inliers.
+    """
+    total = np.bincount(pairs.ravel(), np.repeat(count, 2))
+    return np.argsort(np.argsort(-total, kind="stable"))
+
 
 class _Search:
     """The mapper's search for an initial pair among images with known poses.
@@ -298,9 +346,7 @@ class _Search:
             int64 [num_pairs] the pairs, the rank of the image with which each is tried, and its
             place among the pairs of that image.
         """
-        total = np.bincount(self._pairs.ravel(), np.repeat(count, 2))
-        rank_of = np.argsort(np.argsort(-total, kind="stable"))
-        rank = rank_of[self._pairs].min(axis=1)
+        rank = _image_ranks(self._pairs, count)[self._pairs].min(axis=1)
         order = np.lexsort((-count, rank))
         rank = rank[order]
         return order, rank, np.arange(len(rank)) - np.searchsorted(rank, rank)

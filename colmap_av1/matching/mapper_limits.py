@@ -12,10 +12,14 @@ MIN_INLIERS = 15
 INITIAL_MIN_INLIERS = 100
 INITIAL_MAX_FORWARD_MOTION = 0.95
 INITIAL_MIN_ANGLE = 16.0
-# If no pair meets these limits, the mapper halves the number of inliers, then the angle.
+# If no pair meets these limits, the mapper halves the number of inliers, then the angle, twice.
 LOWER_INITIAL_LIMITS = {
     "init_min_num_inliers": INITIAL_MIN_INLIERS // 2,
     "init_min_tri_angle": INITIAL_MIN_ANGLE / 2,
+}
+LOWEST_INITIAL_LIMITS = {
+    "init_min_num_inliers": INITIAL_MIN_INLIERS // 4,
+    "init_min_tri_angle": INITIAL_MIN_ANGLE / 4,
 }
 # If no pair has 8 degrees either, the mapper halves the angle again. Before that, it tries hundreds
 # or thousands of pairs, and RANSAC may give one of them a wrong pose with a large angle.

@@ -129,10 +129,18 @@ def _start(settings: dict[str, Any]) -> list[str] | None:
     output = Path(settings["model"]) / "start"
     output.mkdir(exist_ok=True)
     callbacks: Any = {"initial_image_pair_callback": start, "next_image_callback": go_on}
+    first_images = [how.init_image_id1]  # any image
+    if settings["first_image"] is not None:
+        first_images.insert(0, settings["first_image"])
+    models = {}
     try:
-        models = pycolmap.incremental_mapping(
-            settings["database"], output, output, options=how, **callbacks
-        )
+        for number in first_images:
+            how.init_image_id1 = number
+            models = pycolmap.incremental_mapping(
+                settings["database"], output, output, options=how, **callbacks
+            )
+            if models:
+                break
     except _EnoughImagesError:
         return None
     if not models:

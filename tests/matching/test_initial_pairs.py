@@ -11,11 +11,13 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import prepare_start
+from colmap_av1.matching.initial_pairs import LoweredStart, prepare_start
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
     INITIAL_MIN_INLIERS,
+    LOWER_INITIAL_LIMITS,
+    LOWEST_INITIAL_LIMITS,
     SMALL_ANGLES,
     InitialLimits,
 )
@@ -150,11 +152,16 @@ def test_pair_with_a_wrong_pose_is_demoted(
 
 
 @pytest.mark.parametrize(
-    ("angle", "limits", "is_certain"),
-    [(30.0, DEFAULT_LIMITS, True), (10.0, SMALL_ANGLES, True), (3.0, SMALL_ANGLES, False)],
+    ("angle", "limits", "is_certain", "lowered"),
+    [
+        (30.0, DEFAULT_LIMITS, True, LOWER_INITIAL_LIMITS),
+        (12.0, SMALL_ANGLES, True, LOWER_INITIAL_LIMITS),
+        (6.0, SMALL_ANGLES, True, LOWEST_INITIAL_LIMITS),
+        (3.0, SMALL_ANGLES, False, None),
+    ],
 )
 def test_limits_depend_on_the_largest_angle(
-    angle: float, limits: InitialLimits, is_certain: bool
+    angle: float, limits: InitialLimits, is_certain: bool, lowered: dict[str, float] | None
 ) -> None:
     keypoints, matches = two_views(4.0, np.random.default_rng(0), 400, angle)
     geometry = verified(keypoints, matches)
@@ -164,6 +171,7 @@ def test_limits_depend_on_the_largest_angle(
     found = prepare_start(matched, [CAMERA] * 2, Clock(), [poses])
     assert found.limits == limits
     assert found.is_certain == is_certain
+    assert found.lowered == (None if lowered is None else LoweredStart(lowered, first_image=0))
     assert found.matched.geometries[0] is geometry
 
 

@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, make_scene, match_scene
 
+from colmap_av1.database.reading import read_images
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
@@ -19,7 +20,8 @@ from colmap_av1.matching.initial_pairs import PreparedStart
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS, INITIAL_MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.verify import verify_pairs
-from colmap_av1.options import CameraOptions
+from colmap_av1.options import CameraOptions, MapOptions
+from colmap_av1.poses.mapper import start_mapper
 from colmap_av1.poses.start_trials import demote_failing_starts
 from colmap_av1.util.run_context import RunContext
 
@@ -119,3 +121,22 @@ def test_pairs_keep_their_inliers_if_no_start_succeeds(with_moving_object: Match
     start = PreparedStart(alone, DEFAULT_LIMITS, is_certain=True, may_meet_defaults=True)
     found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, RunContext())
     assert found.geometries == alone.geometries
+
+
+def test_start_with_an_image_without_matches_is_any_start(
+    with_moving_object: MatchedImages, tmp_path: Path
+) -> None:
+    nothing = ImageKeypoints(NUM_IMAGES, np.empty((0, 2), np.float32), np.arange(0))
+    matched = replace(with_moving_object, keypoints=[*with_moving_object.keypoints, nothing])
+    database = tmp_path / "a.db"
+    write_matched_images(database, [*NAMES, "last.jpg"], CAMERA, matched)
+    (last,) = (image.image_id for image in read_images(database) if image.name == "last.jpg")
+    options = MapOptions(mapper="incremental", seed=0, num_threads=1)
+    found = [
+        start_mapper(
+            database, options, 10, log=tmp_path / "log", initial_pair={}, first_image=first_image
+        )
+        for first_image in (None, last)
+    ]
+    assert found[0] is not None
+    assert found[0] == found[1]
