@@ -294,9 +294,9 @@ class _Search:
     def pairs_before_a_good_one(self, limits: InitialLimits) -> set[int] | None:
         """Pairs that the mapper may find before it finds a good one.
 
-        A pair is good if its pose is right and a large model grows from it. If the limits are not
-        the default ones, it must also meet them with certainty: RANSAC may get a pose wrong if the
-        angle is only a few degrees.
+        A pair is good if its pose is known and right and a large model grows from it. If the limits
+        are not the default ones, it must also meet them with certainty: RANSAC may get a pose wrong
+        if the angle is only a few degrees.
 
         Returns:
             Indices of the pairs, without neighbours; None if no good pair certainly meets the
@@ -304,8 +304,8 @@ class _Search:
         """
         found = self._found
         certain = found.certain(limits) & found.is_known
-        possible = found.possible(limits) & found.is_known
-        is_sound = ~found.is_wrong if limits == DEFAULT_LIMITS else certain
+        possible = found.possible(limits)
+        is_sound = ~found.is_wrong & found.is_known if limits == DEFAULT_LIMITS else certain
         if not certain.any():
             return None
         early = set[int]()

@@ -218,3 +218,24 @@ def test_pair_with_few_inliers_is_demoted_if_no_pair_has_a_large_angle() -> None
     found = prepare_start(matched, [CAMERA] * 10, Clock(), [poses])
     kept = [a is b for a, b in zip(found.matched.geometries, geometries, strict=True)]
     assert kept == [True, False, True]
+
+
+def test_pair_of_unknown_pose_is_demoted_if_the_mapper_would_try_it_first() -> None:
+    """An image outside the joint estimate belongs to no model that is known to grow."""
+    rng = np.random.default_rng(3)
+    views = [turned_views(0.5, 0.3, count, rng) for count in (300, 600)]
+    pairs = np.array([[0, 5], [6, 9]], dtype=np.int32)
+    nothing = np.empty((0, 2), np.float32)
+    keypoints = [ImageKeypoints(i, nothing, np.arange(0)) for i in range(10)]
+    for pair, (own, _) in zip(pairs.tolist(), views, strict=True):
+        keypoints[pair[0]], keypoints[pair[1]] = own
+    geometries = [verified(*own) for own in views]
+    matched = MatchedImages(
+        keypoints, pairs, [g.inlier_matches for g in geometries], geometries, False
+    )
+    turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
+    poses: list[NDArray[np.float64] | None] = [None] * 10
+    poses[0], poses[5] = np.eye(3, 4), np.column_stack([turn, [0, 0, 1] - turn[:, 2]])
+    found = prepare_start(matched, [CAMERA] * 10, Clock(), [poses])
+    kept = [a is b for a, b in zip(found.matched.geometries, geometries, strict=True)]
+    assert kept == [True, False]
