@@ -31,8 +31,8 @@ _SHORTEST, _LONGEST = 0.3, 5.0
 _LONG = 1.2
 # Larger image sides in pixels are damaged data.
 _LONGEST_SIDE = 1 << 20
-# One distortion parameter suffices if it changes positions by less than this RMS distance in
-# pixels, about the accuracy of keypoints.
+# One distortion parameter suffices if the camera that has only one moves positions by at most this
+# RMS distance in pixels, about the accuracy of keypoints.
 _ONE_PARAMETER_ERROR = 0.5
 # Positions per image side at which distortion is compared.
 _GRID = 32
@@ -135,8 +135,8 @@ def with_initial_intrinsics(camera: pycolmap.Camera) -> pycolmap.Camera:
 def with_one_distortion_parameter(camera: pycolmap.Camera) -> pycolmap.Camera:
     """The SIMPLE_RADIAL camera closest to a RADIAL one.
 
-    The first images of a model rarely determine a second distortion parameter. It may diverge when
-    COLMAP's mapper refines it together with them, so that no further image registers.
+    The first images of a model rarely determine a second distortion parameter. COLMAP's mapper
+    refines it all the same. It may then diverge, and no further image registers.
 
     Returns:
         The given camera if its distortion needs both parameters.
@@ -152,7 +152,7 @@ def with_one_distortion_parameter(camera: pycolmap.Camera) -> pycolmap.Camera:
         return camera
     # A radius r in normalised coordinates is at f r + f k r^3 pixels.
     terms = np.column_stack([radius, radius**3])
-    (focal_length, cubic), *_ = np.linalg.lstsq(terms, distorted)
+    (focal_length, cubic), *_ = np.linalg.lstsq(terms, distorted, rcond=None)
     errors = terms @ (focal_length, cubic) - distorted
     if np.sqrt(np.mean(errors**2)) > _ONE_PARAMETER_ERROR:
         return camera

@@ -20,7 +20,7 @@ from colmap_av1.matching.mapper_limits import (
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
     LOWER_INITIAL_LIMITS,
-    LOWEST_INITIAL_LIMITS,
+    LOWERED_INITIAL_LIMITS,
     SMALL_ANGLES,
     InitialLimits,
 )
@@ -67,6 +67,20 @@ _ERROR_QUANTILE = 0.9
 
 
 @dataclass(frozen=True)
+class TrialStart:
+    """How a trial of the mapper begins.
+
+    Attributes:
+        options: limits of the initial pair, by the names of the mapper's options; those that are
+            missing have their defaults.
+        first_image: index of an image of the initial pair; None: the mapper chooses one.
+    """
+
+    options: dict[str, float]
+    first_image: int | None = None
+
+
+@dataclass(frozen=True)
 class PreparedStart:
     """Matches from which COLMAP's incremental mapper starts well.
 
@@ -74,28 +88,13 @@ class PreparedStart:
         matched: the images. Pairs that would be a bad initial pair have fewer inliers.
         limits: the limits of the initial pair that the mapper needs.
         is_certain: a pair certainly meets these limits. If not, the mapper may have to lower them.
-        may_meet_defaults: a pair with a known pose may meet the default limits.
-        lowered: how the mapper begins if no pair meets the default limits; None if it is not known.
+        without_options: how the mapper begins with its default options.
     """
 
     matched: MatchedImages
     limits: InitialLimits
     is_certain: bool
-    may_meet_defaults: bool
-    lowered: LoweredStart | None = None
-
-
-@dataclass(frozen=True)
-class LoweredStart:
-    """How the mapper probably begins if no pair meets its default limits.
-
-    Attributes:
-        options: the lower limits, by the names of the mapper's options.
-        first_image: index of an image of the initial pair.
-    """
-
-    options: dict[str, float]
-    first_image: int
+    without_options: TrialStart
 
 
 def prepare_start(
@@ -115,8 +114,8 @@ def prepare_start(
     Known poses also show with which limits the mapper begins with a pair that grows to the largest
     model, or nearly, see `Growth`. These limits are chosen, the default ones if possible, and those
     for forward motion only if necessary: somebody who walks through a room moves forward most of
-    the time, but not always. Worse pairs that the mapper would find earlier are demoted, except
-    neighbours.
+    the time, but not always. Pairs that are worse, or whose pose is not known, and that the mapper
+    would find earlier are demoted, except neighbours.
 
     If no pair meets the default limits, the mapper tries hundreds of pairs with few inliers. RANSAC
     may give any of them a wrong pose with a large angle, or intrinsics may diverge. With known
@@ -158,14 +157,13 @@ def prepare_start(
         geometries = list(matched.geometries)
         for k in demote:
             geometries[k] = demoted(geometries[k])
-    found.count[list(demote)] = np.minimum(found.count[list(demote)], _MIN_INLIERS - 1)
-    may_meet_defaults = bool((found.possible(DEFAULT_LIMITS) & found.is_known).any())
+    count = found.count.copy()
+    count[list(demote)] = np.minimum(count[list(demote)], _MIN_INLIERS - 1)
     return PreparedStart(
         replace(matched, geometries=geometries),
         limits,
         is_certain,
-        may_meet_defaults,
-        found.lowered_start(matched.pairs),
+        _start_without_options(matched.pairs, replace(found, count=count)),
     )
 
 
@@ -247,20 +245,29 @@ class _Candidates:
         is_possible &= self.angle >= _WIDE_SHARE * limits.init_min_tri_angle
         return is_possible & (self.along < limits.init_max_forward_motion + _ALONG_MARGIN)
 
-    def lowered_start(self, pairs: NDArray[np.int32]) -> LoweredStart | None:
-        """How the mapper begins if no pair meets the default limits.
 
-        Args:
-            pairs: int32 [num_pairs, 2] indices of images.
-        """
-        rank_of = _image_ranks(pairs, self.count)
-        for options in (LOWER_INITIAL_LIMITS, LOWEST_INITIAL_LIMITS):
-            meets = self.count >= options["init_min_num_inliers"]
-            meets &= self.angle >= options["init_min_tri_angle"]
-            own = pairs[meets & (self.along < INITIAL_MAX_FORWARD_MOTION)].ravel()
-            if len(own) > 0:
-                return LoweredStart(options, int(own[rank_of[own].argmin()]))
-        return None
+def _start_without_options(pairs: NDArray[np.int32], found: _Candidates) -> TrialStart:
+    """How the mapper begins with its default options.
+
+    If no pair meets the default limits, the mapper tries all pairs with higher limits before it
+    finds one with lower limits, which takes many seconds. The limits and an image of the first pair
+    that certainly meets them are therefore predicted.
+
+    Args:
+        pairs: int32 [num_pairs, 2] indices of images.
+        found: what is known of the pairs.
+    """
+    if found.possible(DEFAULT_LIMITS).any():
+        return TrialStart({})
+    rank_of = _image_ranks(pairs, found.count)
+    for options in LOWERED_INITIAL_LIMITS:
+        meets = found.along < INITIAL_MAX_FORWARD_MOTION - _ALONG_MARGIN
+        meets &= found.count >= options["init_min_num_inliers"]
+        meets &= found.angle >= _MARGIN * options["init_min_tri_angle"]
+        own = pairs[meets].ravel()
+        if len(own) > 0:
+            return TrialStart(options, int(own[rank_of[own].argmin()]))
+    return TrialStart(LOWER_INITIAL_LIMITS)
 
 
 def _image_ranks(pairs: NDArray[np.int32], count: NDArray[np.int64]) -> NDArray[np.int64]:

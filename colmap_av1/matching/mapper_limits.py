@@ -12,15 +12,18 @@ MIN_INLIERS = 15
 INITIAL_MIN_INLIERS = 100
 INITIAL_MAX_FORWARD_MOTION = 0.95
 INITIAL_MIN_ANGLE = 16.0
-# If no pair meets these limits, the mapper halves the number of inliers, then the angle, twice.
-LOWER_INITIAL_LIMITS = {
-    "init_min_num_inliers": INITIAL_MIN_INLIERS // 2,
-    "init_min_tri_angle": INITIAL_MIN_ANGLE / 2,
-}
-LOWEST_INITIAL_LIMITS = {
-    "init_min_num_inliers": INITIAL_MIN_INLIERS // 4,
-    "init_min_tri_angle": INITIAL_MIN_ANGLE / 4,
-}
+# If no pair meets these limits, the mapper halves the number of inliers, then the angle, then both
+# once more in this order.
+LOWERED_INITIAL_LIMITS = tuple(
+    {"init_min_num_inliers": INITIAL_MIN_INLIERS // few, "init_min_tri_angle": angle}
+    for few, angle in (
+        (2, INITIAL_MIN_ANGLE),
+        (2, INITIAL_MIN_ANGLE / 2),
+        (4, INITIAL_MIN_ANGLE / 2),
+        (4, INITIAL_MIN_ANGLE / 4),
+    )
+)
+LOWER_INITIAL_LIMITS = LOWERED_INITIAL_LIMITS[1]
 # If no pair has 8 degrees either, the mapper halves the angle again. Before that, it tries hundreds
 # or thousands of pairs, and RANSAC may give one of them a wrong pose with a large angle.
 INITIAL_LEAST_ANGLE = INITIAL_MIN_ANGLE / 4

@@ -436,7 +436,8 @@ def _cameras(run: Run, image_set: ImageSet, models: Sequence[_Model]) -> list[py
         cameras.append(found if is_known else camera)
     if run.options.match.camera.camera_model is not None:
         return cameras
-    simple = {id(c): with_one_distortion_parameter(c) for c in cameras if c.model_name == "RADIAL"}
+    radial = {id(camera): camera for camera in cameras if camera.model_name == "RADIAL"}
+    simple = {key: with_one_distortion_parameter(camera) for key, camera in radial.items()}
     return [simple.get(id(camera), camera) for camera in cameras]
 
 

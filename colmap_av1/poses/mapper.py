@@ -169,7 +169,8 @@ def start_mapper(
         num_images: number of images at which the mapper is stopped.
         log: file for the output of the mapper.
         initial_pair: limits for the initial pair, in addition to the options.
-        first_image: id of an image of the initial pair; None, or if no model begins with it: any.
+        first_image: id of an image of the initial pair; None: any. The mapper lowers its limits for
+            this image; if no model begins with it even then, any image is tried.
 
     Returns:
         Names of the images of a first model that remains smaller; None if it does not, or if the

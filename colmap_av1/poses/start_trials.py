@@ -18,10 +18,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.database.reading import read_images
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import PreparedStart, are_far, demoted
+from colmap_av1.matching.initial_pairs import PreparedStart, TrialStart, are_far, demoted
 from colmap_av1.matching.mapper_limits import FORWARD_MOTION, LOWER_INITIAL_LIMITS, SMALL_ANGLES
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
@@ -48,9 +47,9 @@ def demote_failing_starts(
 
     The mapper runs with one thread and the seed 0, with the options that `match` prints, and for
     small angles also without them. Other seeds and versions mostly start alike. If no pair meets
-    the default limits of an initial pair, the trials without options begin with the lower limits
-    that the mapper tries later, and with the image that it then finds. To find that no other pair
-    meets the limits takes many seconds.
+    the default limits of an initial pair, the first trial without options begins with the limits
+    and the image that are predicted, see `PreparedStart`. It does not show whether RANSAC would
+    give a pair a wrong pose that meets higher limits.
 
     Args:
         start: the images, and the mapper's limits.
@@ -81,41 +80,32 @@ def demote_failing_starts(
         camera.has_prior_focal_length = True
     known = [copies[id(camera)] for camera in cameras]
 
-    def failing_start(
-        limits: dict[str, float], first_image: int | None, matched: MatchedImages
-    ) -> list[str] | None:
+    def failing_start(trial: TrialStart, matched: MatchedImages) -> list[str] | None:
+        first_image = None
+        # After a demotion, the mapper may begin with another image.
+        if trial.first_image is not None and matched is start.matched:
+            first_image = trial.first_image + 1  # new databases number images from 1
         with tempfile.TemporaryDirectory() as folder:
             database, log = Path(folder) / "matches.db", Path(folder) / "log"
             write_matched_images(database, names, known, matched)
-            number = None
-            if first_image is not None:
-                number_of = {image.name: image.image_id for image in read_images(database)}
-                number = number_of[names[first_image]]
             return start_mapper(
-                database, options, num_images, log=log, initial_pair=limits, first_image=number
+                database,
+                options,
+                num_images,
+                log=log,
+                initial_pair=trial.options,
+                first_image=first_image,
             )
 
+    lower = {} if start.is_certain else LOWER_INITIAL_LIMITS
+    series = [TrialStart({**lower, **start.limits.options})]
+    if start.limits == SMALL_ANGLES:
+        series.append(start.without_options)
     found = start.matched
     with context.clock.measure("verification"):
-        for limits, first_image in _tried_limits(start):
-            found = _without_failing_starts(
-                found, names, partial(failing_start, limits, first_image)
-            )
+        for trial in series:
+            found = _without_failing_starts(found, names, partial(failing_start, trial))
     return found
-
-
-def _tried_limits(start: PreparedStart) -> list[tuple[dict[str, float], int | None]]:
-    """Limits of the initial pair for each series of trials, and the index of its first image."""
-    lower = {} if start.is_certain else LOWER_INITIAL_LIMITS
-    series: list[tuple[dict[str, float], int | None]] = [({**lower, **start.limits.options}, None)]
-    if start.limits == SMALL_ANGLES:
-        if start.may_meet_defaults:
-            series.append(({}, None))
-        elif start.lowered is None:
-            series.append((LOWER_INITIAL_LIMITS, None))
-        else:
-            series.append((start.lowered.options, start.lowered.first_image))
-    return series
 
 
 def _without_failing_starts(

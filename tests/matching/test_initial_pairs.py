@@ -11,13 +11,12 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import LoweredStart, prepare_start
+from colmap_av1.matching.initial_pairs import TrialStart, prepare_start
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
     INITIAL_MIN_INLIERS,
-    LOWER_INITIAL_LIMITS,
-    LOWEST_INITIAL_LIMITS,
+    LOWERED_INITIAL_LIMITS,
     SMALL_ANGLES,
     InitialLimits,
 )
@@ -152,16 +151,16 @@ def test_pair_with_a_wrong_pose_is_demoted(
 
 
 @pytest.mark.parametrize(
-    ("angle", "limits", "is_certain", "lowered"),
+    ("angle", "limits", "is_certain", "without_options"),
     [
-        (30.0, DEFAULT_LIMITS, True, LOWER_INITIAL_LIMITS),
-        (12.0, SMALL_ANGLES, True, LOWER_INITIAL_LIMITS),
-        (6.0, SMALL_ANGLES, True, LOWEST_INITIAL_LIMITS),
-        (3.0, SMALL_ANGLES, False, None),
+        (30.0, DEFAULT_LIMITS, True, TrialStart({})),
+        (12.0, SMALL_ANGLES, True, TrialStart(LOWERED_INITIAL_LIMITS[1], 0)),
+        (6.0, SMALL_ANGLES, True, TrialStart(LOWERED_INITIAL_LIMITS[3], 0)),
+        (3.0, SMALL_ANGLES, False, TrialStart(LOWERED_INITIAL_LIMITS[1])),
     ],
 )
 def test_limits_depend_on_the_largest_angle(
-    angle: float, limits: InitialLimits, is_certain: bool, lowered: dict[str, float] | None
+    angle: float, limits: InitialLimits, is_certain: bool, without_options: TrialStart
 ) -> None:
     keypoints, matches = two_views(4.0, np.random.default_rng(0), 400, angle)
     geometry = verified(keypoints, matches)
@@ -171,7 +170,7 @@ def test_limits_depend_on_the_largest_angle(
     found = prepare_start(matched, [CAMERA] * 2, Clock(), [poses])
     assert found.limits == limits
     assert found.is_certain == is_certain
-    assert found.lowered == (None if lowered is None else LoweredStart(lowered, first_image=0))
+    assert found.without_options == without_options
     assert found.matched.geometries[0] is geometry
 
 
@@ -239,3 +238,18 @@ def test_pair_of_unknown_pose_is_demoted_if_the_mapper_would_try_it_first() -> N
     found = prepare_start(matched, [CAMERA] * 10, Clock(), [poses])
     kept = [a is b for a, b in zip(found.matched.geometries, geometries, strict=True)]
     assert kept == [True, False]
+
+
+def test_mapper_without_options_begins_with_the_image_that_has_most_matches() -> None:
+    rng = np.random.default_rng(0)
+    views = [two_views(4.0, rng, count, 6.0) for count in (200, 400)]
+    geometries = [verified(*own) for own in views]
+    matched = MatchedImages(
+        [keypoints for own, _ in views for keypoints in own],
+        np.array([[0, 1], [2, 3]], dtype=np.int32),
+        [g.inlier_matches for g in geometries],
+        geometries,
+        False,
+    )
+    found = prepare_start(matched, [CAMERA] * 4, Clock())
+    assert found.without_options == TrialStart(LOWERED_INITIAL_LIMITS[3], 2)

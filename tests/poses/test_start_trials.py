@@ -12,11 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, make_scene, match_scene
 
-from colmap_av1.database.reading import read_images
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import PreparedStart
+from colmap_av1.matching.initial_pairs import PreparedStart, TrialStart
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS, INITIAL_MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.verify import verify_pairs
@@ -92,13 +91,15 @@ def num_registered(matched: MatchedImages, folder: Path) -> list[int]:
     return [found[number].num_reg_images() for number in sorted(found)]
 
 
+def prepared(matched: MatchedImages) -> PreparedStart:
+    return PreparedStart(matched, DEFAULT_LIMITS, is_certain=True, without_options=TrialStart({}))
+
+
 def test_pair_from_which_no_model_grows_is_demoted(
     with_moving_object: MatchedImages, tmp_path: Path
 ) -> None:
     assert num_registered(with_moving_object, tmp_path / "before")[0] < NUM_IMAGES / 2
-    start = PreparedStart(
-        with_moving_object, DEFAULT_LIMITS, is_certain=True, may_meet_defaults=True
-    )
+    start = prepared(with_moving_object)
     found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, RunContext())
     assert num_registered(found, tmp_path / "after") == [NUM_IMAGES]
     counts = [len(geometry.inlier_matches) for geometry in found.geometries[-3:]]
@@ -106,7 +107,7 @@ def test_pair_from_which_no_model_grows_is_demoted(
 
 
 def test_pairs_keep_their_inliers_if_the_mapper_starts_well(scene: MatchedImages) -> None:
-    start = PreparedStart(scene, DEFAULT_LIMITS, is_certain=True, may_meet_defaults=True)
+    start = prepared(scene)
     found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, RunContext())
     assert found.geometries == scene.geometries
 
@@ -118,25 +119,25 @@ def test_pairs_keep_their_inliers_if_no_start_succeeds(with_moving_object: Match
         matches=with_moving_object.matches[-3:],
         geometries=with_moving_object.geometries[-3:],
     )
-    start = PreparedStart(alone, DEFAULT_LIMITS, is_certain=True, may_meet_defaults=True)
+    start = prepared(alone)
     found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, RunContext())
     assert found.geometries == alone.geometries
 
 
-def test_start_with_an_image_without_matches_is_any_start(
+def test_given_first_image_is_tried_before_any_other(
     with_moving_object: MatchedImages, tmp_path: Path
 ) -> None:
     nothing = ImageKeypoints(NUM_IMAGES, np.empty((0, 2), np.float32), np.arange(0))
     matched = replace(with_moving_object, keypoints=[*with_moving_object.keypoints, nothing])
     database = tmp_path / "a.db"
-    write_matched_images(database, [*NAMES, "last.jpg"], CAMERA, matched)
-    (last,) = (image.image_id for image in read_images(database) if image.name == "last.jpg")
+    write_matched_images(database, [*NAMES, "without_matches.jpg"], CAMERA, matched)
     options = MapOptions(mapper="incremental", seed=0, num_threads=1)
-    found = [
+    any_image, first, without_matches = (
         start_mapper(
             database, options, 10, log=tmp_path / "log", initial_pair={}, first_image=first_image
         )
-        for first_image in (None, last)
-    ]
-    assert found[0] is not None
-    assert found[0] == found[1]
+        for first_image in (None, 1, NUM_IMAGES + 1)
+    )
+    assert any_image is not None
+    assert first is None  # the first image does not show the moving object
+    assert without_matches == any_image
