@@ -20,7 +20,7 @@ from colmap_av1.matching.mapper_limits import (
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
     LOWER_INITIAL_LIMITS,
-    LOWERED_INITIAL_LIMITS,
+    RELAXED_INITIAL_LIMITS,
     SMALL_ANGLES,
     InitialLimits,
 )
@@ -157,13 +157,12 @@ def prepare_start(
         geometries = list(matched.geometries)
         for k in demote:
             geometries[k] = demoted(geometries[k])
-    count = found.count.copy()
-    count[list(demote)] = np.minimum(count[list(demote)], _MIN_INLIERS - 1)
+    remaining = replace(found, count=_num_inliers(geometries))
     return PreparedStart(
         replace(matched, geometries=geometries),
         limits,
         is_certain,
-        _start_without_options(matched.pairs, replace(found, count=count)),
+        _start_without_options(matched.pairs, remaining),
     )
 
 
@@ -208,7 +207,7 @@ class _Candidates:
         known: Sequence[Sequence[_Floats | None]],
     ) -> _Candidates:
         """Look at the poses of all pairs."""
-        count = np.array([len(geometry.inlier_matches) for geometry in matched.geometries], int)
+        count = _num_inliers(matched.geometries)
         angle, along, known_along = np.full((3, len(count)), np.nan)
         is_wrong = np.zeros(len(count), np.bool_)
         for k in np.flatnonzero(count >= _MIN_INLIERS).tolist():
@@ -246,6 +245,11 @@ class _Candidates:
         return is_possible & (self.along < limits.init_max_forward_motion + _ALONG_MARGIN)
 
 
+def _num_inliers(geometries: Sequence[TwoViewGeometry]) -> NDArray[np.int64]:
+    """Number of inliers of each pair, int64 [num_pairs]."""
+    return np.array([len(geometry.inlier_matches) for geometry in geometries], np.int64)
+
+
 def _start_without_options(pairs: NDArray[np.int32], found: _Candidates) -> TrialStart:
     """How the mapper begins with its default options.
 
@@ -260,7 +264,7 @@ def _start_without_options(pairs: NDArray[np.int32], found: _Candidates) -> Tria
     if found.possible(DEFAULT_LIMITS).any():
         return TrialStart({})
     rank_of = _image_ranks(pairs, found.count)
-    for options in LOWERED_INITIAL_LIMITS:
+    for options in RELAXED_INITIAL_LIMITS:
         meets = found.along < INITIAL_MAX_FORWARD_MOTION - _ALONG_MARGIN
         meets &= found.count >= options["init_min_num_inliers"]
         meets &= found.angle >= _MARGIN * options["init_min_tri_angle"]

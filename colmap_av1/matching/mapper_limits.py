@@ -14,7 +14,7 @@ INITIAL_MAX_FORWARD_MOTION = 0.95
 INITIAL_MIN_ANGLE = 16.0
 # If no pair meets these limits, the mapper halves the number of inliers, then the angle, then both
 # once more in this order.
-LOWERED_INITIAL_LIMITS = tuple(
+RELAXED_INITIAL_LIMITS = tuple(
     {"init_min_num_inliers": INITIAL_MIN_INLIERS // few, "init_min_tri_angle": angle}
     for few, angle in (
         (2, INITIAL_MIN_ANGLE),
@@ -23,7 +23,7 @@ LOWERED_INITIAL_LIMITS = tuple(
         (4, INITIAL_MIN_ANGLE / 4),
     )
 )
-LOWER_INITIAL_LIMITS = LOWERED_INITIAL_LIMITS[1]
+LOWER_INITIAL_LIMITS = RELAXED_INITIAL_LIMITS[1]
 # If no pair has 8 degrees either, the mapper halves the angle again. Before that, it tries hundreds
 # or thousands of pairs, and RANSAC may give one of them a wrong pose with a large angle.
 INITIAL_LEAST_ANGLE = INITIAL_MIN_ANGLE / 4

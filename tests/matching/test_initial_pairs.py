@@ -16,7 +16,7 @@ from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
     INITIAL_MIN_INLIERS,
-    LOWERED_INITIAL_LIMITS,
+    RELAXED_INITIAL_LIMITS,
     SMALL_ANGLES,
     InitialLimits,
 )
@@ -154,9 +154,9 @@ def test_pair_with_a_wrong_pose_is_demoted(
     ("angle", "limits", "is_certain", "without_options"),
     [
         (30.0, DEFAULT_LIMITS, True, TrialStart({})),
-        (12.0, SMALL_ANGLES, True, TrialStart(LOWERED_INITIAL_LIMITS[1], 0)),
-        (6.0, SMALL_ANGLES, True, TrialStart(LOWERED_INITIAL_LIMITS[3], 0)),
-        (3.0, SMALL_ANGLES, False, TrialStart(LOWERED_INITIAL_LIMITS[1])),
+        (12.0, SMALL_ANGLES, True, TrialStart(RELAXED_INITIAL_LIMITS[1], 0)),
+        (6.0, SMALL_ANGLES, True, TrialStart(RELAXED_INITIAL_LIMITS[3], 0)),
+        (3.0, SMALL_ANGLES, False, TrialStart(RELAXED_INITIAL_LIMITS[1])),
     ],
 )
 def test_limits_depend_on_the_largest_angle(
@@ -252,4 +252,4 @@ def test_mapper_without_options_begins_with_the_image_that_has_most_matches() ->
         False,
     )
     found = prepare_start(matched, [CAMERA] * 4, Clock())
-    assert found.without_options == TrialStart(LOWERED_INITIAL_LIMITS[3], 2)
+    assert found.without_options == TrialStart(RELAXED_INITIAL_LIMITS[3], 2)
