@@ -282,9 +282,11 @@ def match(
         names = images.image_set.images.names
         crash = None
         try:
-            written = demote_failing_starts(
-                start, names, found.cameras, context, fixed_intrinsics=fixed_intrinsics
-            )
+            # With known poses, the mapper's start has been tried with each pair that it may take.
+            if not (known and start.is_certain):
+                written = demote_failing_starts(
+                    start, names, found.cameras, context, fixed_intrinsics=fixed_intrinsics
+                )
         except ModelError:
             crash = (
                 "COLMAP's mapper failed in a trial on this database, and may fail again: if so, "

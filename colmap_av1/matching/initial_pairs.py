@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -11,16 +11,15 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.matching.first_images import first_images
 from colmap_av1.matching.growth import Growth
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
-    INITIAL_MAX_FORWARD_MOTION,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
-    LOWER_INITIAL_LIMITS,
-    RELAXED_INITIAL_LIMITS,
+    RELAXED_LIMITS,
     SMALL_ANGLES,
     InitialLimits,
 )
@@ -56,6 +55,8 @@ _NUM_SOME = 64
 # A rotation is wrong if it differs from a known one by more than this share of the triangulation
 # angle.
 _WRONG = 0.25
+# A homography allows a pose if this share of the points is in front of both cameras.
+_FRONT_SHARE = 0.95
 # The pose of the homography is wrong if its triangulation angle and its error both exceed those of
 # the essential matrix by these factors. If the parallax of nearby images is below the mapper's
 # noise limit of 4 px, the angle is two to ten times as large and the error of most matches two to
@@ -67,20 +68,6 @@ _ERROR_QUANTILE = 0.9
 
 
 @dataclass(frozen=True)
-class TrialStart:
-    """How a trial of the mapper begins.
-
-    Attributes:
-        options: limits of the initial pair, by the names of the mapper's options; those that are
-            missing have their defaults.
-        first_image: index of an image of the initial pair; None: the mapper chooses one.
-    """
-
-    options: dict[str, float]
-    first_image: int | None = None
-
-
-@dataclass(frozen=True)
 class PreparedStart:
     """Matches from which COLMAP's incremental mapper starts well.
 
@@ -88,13 +75,11 @@ class PreparedStart:
         matched: the images. Pairs that would be a bad initial pair have fewer inliers.
         limits: the limits of the initial pair that the mapper needs.
         is_certain: a pair certainly meets these limits. If not, the mapper may have to lower them.
-        without_options: how the mapper begins with its default options.
     """
 
     matched: MatchedImages
     limits: InitialLimits
     is_certain: bool
-    without_options: TrialStart
 
 
 def prepare_start(
@@ -107,9 +92,10 @@ def prepare_start(
 
     COLMAP's mapper takes a pair's pose from its homography if that explains most of the matches
     (`EstimateTwoViewGeometryPose`). If the matches or known poses contradict the pose, a model that
-    begins with the pair fails after a few images, and the mapper still writes it first. A demoted
-    pair keeps enough inliers to connect its images; tracks continue through the pairs between. A
-    bad pair is not demoted if its angle is so small that the mapper finds a good pair first.
+    begins with the pair fails after a few images, and the mapper still writes it first. The same
+    happens if the mapper finds another pose, or if the intrinsics diverge, see `first_images`. A
+    demoted pair keeps enough inliers to connect its images; tracks continue through the pairs
+    between. A bad pair is not demoted if the mapper finds a good pair first.
 
     Known poses also show with which limits the mapper begins with a pair that grows to the largest
     model, or nearly, see `Growth`. These limits are chosen, the default ones if possible, and those
@@ -118,8 +104,8 @@ def prepare_start(
     would find earlier are demoted, except neighbours.
 
     If no pair meets the default limits, the mapper tries hundreds of pairs with few inliers. RANSAC
-    may give any of them a wrong pose with a large angle, or intrinsics may diverge. With known
-    poses, these pairs are demoted, too, except neighbours, which connect the images.
+    may give any of them a wrong pose with a large angle. With known poses, these pairs are demoted,
+    too, except neighbours, which connect the images.
 
     Args:
         matched: the images. The pose of the homography is tested only for pairs with an essential
@@ -131,21 +117,20 @@ def prepare_start(
     """
     with clock.measure("verification"):
         found = _Candidates.of(matched, cameras, known)
+        limits = FORWARD_MOTION if matched.forward_motion else DEFAULT_LIMITS
+        demote = set[int]()
         if known:
-            search = _Search(matched.pairs, found, Growth(matched, cameras, known))
-            limits = FORWARD_MOTION if matched.forward_motion else SMALL_ANGLES
-            is_certain, demote = False, set[int]()
-            for tried in (DEFAULT_LIMITS, SMALL_ANGLES, FORWARD_MOTION):
-                early = search.pairs_before_a_good_one(tried)
-                if early is not None:
-                    limits, is_certain, demote = tried, True, early
-                    break
+            search = _Search(matched, cameras, found, Growth(matched, cameras, known))
+            certain_limits, demote = search.first_certain()
+            is_certain = certain_limits is not None
+            limits = certain_limits or limits
             if limits != DEFAULT_LIMITS:
                 has_few = found.is_far & (found.count < _MARGIN * INITIAL_MIN_INLIERS)
                 demote |= set(np.flatnonzero(has_few & ~np.isnan(found.angle)).tolist())
+            if limits == SMALL_ANGLES:
+                demote = search.bad_pairs_without_options(demote)
         else:
-            limits = FORWARD_MOTION if matched.forward_motion else DEFAULT_LIMITS
-            is_certain, demote = bool(found.certain(limits).any()), set[int]()
+            is_certain = bool(found.certain(limits).any())
         lowest_angle = limits.init_min_tri_angle
         if not is_certain:
             lowest_angle = min(lowest_angle, INITIAL_MIN_ANGLE / 2)
@@ -157,13 +142,7 @@ def prepare_start(
         geometries = list(matched.geometries)
         for k in demote:
             geometries[k] = demoted(geometries[k])
-    remaining = replace(found, count=_num_inliers(geometries))
-    return PreparedStart(
-        replace(matched, geometries=geometries),
-        limits,
-        is_certain,
-        _start_without_options(matched.pairs, remaining),
-    )
+    return PreparedStart(replace(matched, geometries=geometries), limits, is_certain)
 
 
 def demoted(geometry: TwoViewGeometry) -> TwoViewGeometry:
@@ -188,8 +167,11 @@ class _Candidates:
         known_along: float64 [num_pairs] share of the translation of the known pose along the
             optical axis; NaN if it is not known.
         is_wrong: bool [num_pairs] whether the pose is wrong.
-        is_known: bool [num_pairs] whether the pair has an angle and a known pose.
+        is_sound: bool [num_pairs] whether nothing contradicts the pose. If poses of images are
+            known, that of the pair must be.
         is_far: bool [num_pairs] whether the images are no neighbours.
+        pose: for each pair, float64 [3, 4] pose of the second image relative to the first, the
+            known one if there is one; None if the pair has no angle.
     """
 
     count: NDArray[np.int64]
@@ -197,8 +179,9 @@ class _Candidates:
     along: _Floats
     known_along: _Floats
     is_wrong: NDArray[np.bool_]
-    is_known: NDArray[np.bool_]
+    is_sound: NDArray[np.bool_]
     is_far: NDArray[np.bool_]
+    pose: list[_Floats | None]
 
     @staticmethod
     def of(
@@ -207,9 +190,12 @@ class _Candidates:
         known: Sequence[Sequence[_Floats | None]],
     ) -> _Candidates:
         """Look at the poses of all pairs."""
-        count = _num_inliers(matched.geometries)
+        count = np.array(
+            [len(geometry.inlier_matches) for geometry in matched.geometries], np.int64
+        )
         angle, along, known_along = np.full((3, len(count)), np.nan)
         is_wrong = np.zeros(len(count), np.bool_)
+        poses: list[_Floats | None] = [None] * len(count)
         for k in np.flatnonzero(count >= _MIN_INLIERS).tolist():
             pair, geometry = matched.pairs[k].tolist(), matched.geometries[k]
             some = _some_inliers(matched, cameras, pair, geometry)
@@ -218,20 +204,22 @@ class _Candidates:
                 continue
             angle[k], along[k] = _triangulation_angle(pose[:, :3], some.rays), abs(pose[2, 3])
             known_pose = _known_pose(known, pair)
+            poses[k] = pose if known_pose is None else known_pose
             if known_pose is not None:
                 known_along[k] = abs(known_pose[2, 3])
-            flat_angle = _contradicted_angle(geometry, some)
-            if flat_angle is not None:
-                is_wrong[k], angle[k] = True, flat_angle
-            elif known_pose is not None:
-                turned = _angle_between(pose[:, :3], known_pose[:, :3])
-                is_wrong[k] = turned > _WRONG * angle[k]
-        is_known, is_far = ~np.isnan(known_along), are_far(matched.pairs)
-        return _Candidates(count, angle, along, known_along, is_wrong, is_known, is_far)
+            wrong_angle = _contradicted_angle(geometry, some)
+            if wrong_angle is None and known_pose is not None:
+                rotations = [pose[:, :3], *_rotations_of_homography(geometry, some)]
+                wrong_angle = _wrong_angle(rotations, known_pose[:, :3], some.rays)
+            if wrong_angle is not None:
+                is_wrong[k], angle[k] = True, wrong_angle
+        is_sound = ~is_wrong & ~np.isnan(known_along if known else angle)
+        is_far = are_far(matched.pairs)
+        return _Candidates(count, angle, along, known_along, is_wrong, is_sound, is_far, poses)
 
     def certain(self, limits: InitialLimits) -> NDArray[np.bool_]:
         """Whether the mapper certainly accepts each pair, bool [num_pairs]."""
-        is_certain = ~self.is_wrong & (self.count >= _MARGIN * INITIAL_MIN_INLIERS)
+        is_certain = self.is_sound & (self.count >= _MARGIN * limits.init_min_num_inliers)
         is_certain &= self.angle >= _MARGIN * limits.init_min_tri_angle
         if limits.init_max_forward_motion < 1.0:
             along = np.fmax(self.along, self.known_along)
@@ -240,109 +228,113 @@ class _Candidates:
 
     def possible(self, limits: InitialLimits) -> NDArray[np.bool_]:
         """Whether the mapper may accept each pair, bool [num_pairs]."""
-        is_possible = self.count >= INITIAL_MIN_INLIERS
+        is_possible = self.count >= limits.init_min_num_inliers
         is_possible &= self.angle >= _WIDE_SHARE * limits.init_min_tri_angle
         return is_possible & (self.along < limits.init_max_forward_motion + _ALONG_MARGIN)
-
-
-def _num_inliers(geometries: Sequence[TwoViewGeometry]) -> NDArray[np.int64]:
-    """Number of inliers of each pair, int64 [num_pairs]."""
-    return np.array([len(geometry.inlier_matches) for geometry in geometries], np.int64)
-
-
-def _start_without_options(pairs: NDArray[np.int32], found: _Candidates) -> TrialStart:
-    """How the mapper begins with its default options.
-
-    If no pair meets the default limits, the mapper tries all pairs with higher limits before it
-    finds one with lower limits, which takes many seconds. The limits and an image of the first pair
-    that certainly meets them are therefore predicted.
-
-    Args:
-        pairs: int32 [num_pairs, 2] indices of images.
-        found: what is known of the pairs.
-    """
-    if found.possible(DEFAULT_LIMITS).any():
-        return TrialStart({})
-    rank_of = _image_ranks(pairs, found.count)
-    for options in RELAXED_INITIAL_LIMITS:
-        meets = found.along < INITIAL_MAX_FORWARD_MOTION - _ALONG_MARGIN
-        meets &= found.count >= options["init_min_num_inliers"]
-        meets &= found.angle >= _MARGIN * options["init_min_tri_angle"]
-        own = pairs[meets].ravel()
-        if len(own) > 0:
-            return TrialStart(options, int(own[rank_of[own].argmin()]))
-    return TrialStart(LOWER_INITIAL_LIMITS)
-
-
-def _image_ranks(pairs: NDArray[np.int32], count: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The rank of each image, int64 [num_images]: the mapper tries those with most matches first.
-
-    Args:
-        pairs: int32 [num_pairs, 2] indices of images.
-        count: int64 [num_pairs] number of inliers.
-    """
-    total = np.bincount(pairs.ravel(), np.repeat(count, 2))
-    return np.argsort(np.argsort(-total, kind="stable"))
 
 
 class _Search:
     """The mapper's search for an initial pair among images with known poses.
 
     Args:
-        pairs: int32 [num_pairs, 2] indices of images.
+        matched: the images.
+        cameras: the camera of each image.
         found: what is known of the pairs.
         growth: the growth of models.
     """
 
-    def __init__(self, pairs: NDArray[np.int32], found: _Candidates, growth: Growth) -> None:
-        self._pairs, self._found, self._growth = pairs, found, growth
+    def __init__(
+        self,
+        matched: MatchedImages,
+        cameras: Sequence[pycolmap.Camera],
+        found: _Candidates,
+        growth: Growth,
+    ) -> None:
+        self._matched, self._cameras, self._found = matched, cameras, found
+        self._growth = growth
         self._known_large = dict[int, bool]()
-        some = np.flatnonzero(found.certain(FORWARD_MOTION) & found.is_known)
+        self._known_begun = dict[tuple[int, InitialLimits], bool | None]()
+        some = np.flatnonzero(found.certain(FORWARD_MOTION))
         some = some[evenly_spread(len(some), _NUM_GROWN)]
-        grown = [int(growth.registered(pairs[k].tolist()).sum()) for k in some]
+        grown = [int(growth.registered(matched.pairs[k].tolist()).sum()) for k in some]
         self._large_size = math.ceil(_LARGE * max(grown, default=0))
 
-    def pairs_before_a_good_one(self, limits: InitialLimits) -> set[int] | None:
-        """Pairs that the mapper may find before it finds a good one.
-
-        A pair is good if its pose is known and right and a large model grows from it. If the limits
-        are not the default ones, it must also meet them with certainty: RANSAC may get a pose wrong
-        if the angle is only a few degrees.
+    def first_certain(self) -> tuple[InitialLimits | None, set[int]]:
+        """The first limits with which the mapper finds a good pair, and the bad pairs before it.
 
         Returns:
-            Indices of the pairs, without neighbours; None if no good pair certainly meets the
-            limits.
+            The limits; None if no good pair certainly meets any of them. Indices of the pairs.
+        """
+        for limits in (DEFAULT_LIMITS, SMALL_ANGLES, FORWARD_MOTION):
+            if self._found.certain(limits).any():
+                bad, has_good = self.bad_pairs(limits)
+                if has_good:
+                    return limits, bad
+        return None, set()
+
+    def bad_pairs_without_options(self, demoted: set[int]) -> set[int]:
+        """Pairs that the mapper may find before a good one while it lowers its limits by itself.
+
+        Args:
+            demoted: indices of pairs that are demoted.
+
+        Returns:
+            Indices of these pairs, including the demoted ones.
+        """
+        bad = demoted
+        for limits in (DEFAULT_LIMITS, *RELAXED_LIMITS):
+            bad, has_good = self.bad_pairs(limits, bad)
+            if has_good:
+                break
+        return bad
+
+    def bad_pairs(
+        self, limits: InitialLimits, demoted: Collection[int] = ()
+    ) -> tuple[set[int], bool]:
+        """Pairs that the mapper may find before it finds a good one.
+
+        A pair is good if its pose is right, as far as is known, a large model grows from it, and
+        the mapper does not fail to begin with it. If the limits are not the default ones, it must
+        also meet them with certainty: RANSAC may get a pose wrong if the angle is only a few
+        degrees.
+
+        Args:
+            limits: the limits of the initial pair.
+            demoted: indices of pairs that are demoted.
+
+        Returns:
+            Indices of bad pairs, including the demoted ones; neighbours only if the mapper fails
+            with them. Whether a good pair certainly meets the limits.
         """
         found = self._found
-        certain = found.certain(limits) & found.is_known
-        possible = found.possible(limits)
-        is_sound = ~found.is_wrong & found.is_known if limits == DEFAULT_LIMITS else certain
-        if not certain.any():
-            return None
-        early = set[int]()
+        certain, possible = found.certain(limits), found.possible(limits)
+        is_sound = found.is_sound if limits == DEFAULT_LIMITS else certain
+        bad = set(demoted)
         while True:
             count = found.count.copy()
-            count[list(early)] = _MIN_INLIERS - 1
-            num_before = len(early)
+            count[list(bad)] = np.minimum(count[list(bad)], _MIN_INLIERS - 1)
+            num_before = len(bad)
             order, rank, place = self._order(count)
             first = None  # the first certain pair, as a place in the order
             for i, k in enumerate(order.tolist()):
-                if not possible[k] or count[k] < INITIAL_MIN_INLIERS:
+                if not possible[k] or count[k] < limits.init_min_num_inliers:
                     continue
                 if first is not None:
                     if rank[i] >= rank[first] + _NUM_THREADS:
                         break
                     if rank[i] == rank[first] or place[i] > 2 * place[first] + _NUM_AHEAD:
                         continue
-                is_good = is_sound[k] and self._is_large(k)
-                if not is_good and found.is_far[k]:
-                    early.add(k)
-                elif is_good and certain[k] and first is None:
+                if not (is_sound[k] and self._is_large(k)):
+                    if found.is_far[k]:
+                        bad.add(k)
+                    continue
+                has_begun = self._begins(k, limits)
+                if has_begun is False:
+                    bad.add(k)
+                elif has_begun and certain[k] and first is None:
                     first = i
-            if first is None:
-                return None
-            if len(early) == num_before:
-                return early
+            if first is None or len(bad) == num_before:
+                return bad, first is not None
 
     def _order(
         self, count: NDArray[np.int64]
@@ -357,7 +349,9 @@ class _Search:
             int64 [num_pairs] the pairs, the rank of the image with which each is tried, and its
             place among the pairs of that image.
         """
-        rank = _image_ranks(self._pairs, count)[self._pairs].min(axis=1)
+        pairs = self._matched.pairs
+        total = np.bincount(pairs.ravel(), np.repeat(count, 2))
+        rank = np.argsort(np.argsort(-total, kind="stable"))[pairs].min(axis=1)
         order = np.lexsort((-count, rank))
         rank = rank[order]
         return order, rank, np.arange(len(rank)) - np.searchsorted(rank, rank)
@@ -365,9 +359,36 @@ class _Search:
     def _is_large(self, k: int) -> bool:
         """Whether a large model grows from a pair."""
         if k not in self._known_large:
-            grown = self._growth.registered(self._pairs[k].tolist(), max_images=self._large_size)
+            pair = self._matched.pairs[k].tolist()
+            grown = self._growth.registered(pair, max_images=self._large_size)
             self._known_large[k] = int(grown.sum()) >= self._large_size
         return self._known_large[k]
+
+    def _begins(self, k: int, limits: InitialLimits) -> bool | None:
+        """Whether the mapper begins well with a pair; None if it does not begin with it."""
+        if (k, limits) not in self._known_begun:
+            self._known_begun[k, limits] = self._begins_in_trial(k, limits)
+        return self._known_begun[k, limits]
+
+    def _begins_in_trial(self, k: int, limits: InitialLimits) -> bool | None:
+        first, second = pair = self._matched.pairs[k].tolist()
+        camera, pose = self._cameras[first], self._found.pose[k]
+        assert pose is not None
+        # With a zoom, each image has its own camera, and two images determine neither.
+        if camera is not self._cameras[second]:
+            return True
+        inliers = self._matched.geometries[k].inlier_matches.T
+        xy = [
+            self._matched.keypoints[image].xy[own] for image, own in zip(pair, inliers, strict=True)
+        ]
+        begun = first_images(xy, camera, limits)
+        if begun is None:
+            return None
+        # With forward motion, the mapper keeps the intrinsics.
+        if begun.diverged and limits != FORWARD_MOTION:
+            return False
+        turned = _angle_between(begun.cam2_from_cam1[:, :3], pose[:, :3])
+        return bool(turned <= _WRONG * max(limits.init_min_tri_angle, self._found.angle[k]))
 
 
 def are_far(pairs: NDArray[np.int32]) -> NDArray[np.bool_]:
@@ -444,6 +465,35 @@ def _pose_of_homography(H: _Floats, inliers: _PairInliers) -> _Floats:
     matrices = [camera.calibration_matrix() for camera in inliers.cameras]
     found = pycolmap.pose_from_homography_matrix(H, *matrices, *(own.T for own in inliers.rays))
     return np.asarray(found["cam2_from_cam1"].matrix())
+
+
+def _rotations_of_homography(geometry: TwoViewGeometry, inliers: _PairInliers) -> list[_Floats]:
+    """The rotations, float64 [3, 3], that the homography of a flat pair allows.
+
+    With two of them, nearly all points are in front of both cameras: the mapper may choose either.
+    """
+    if geometry.config not in FLAT_CONFIGS or geometry.H is None:
+        return []
+    a, b = (camera.calibration_matrix() for camera in inliers.cameras)
+    H = np.linalg.inv(b) @ geometry.H @ a
+    _, rotations, _, normals = cv2.decomposeHomographyMat(H, np.eye(3))
+    # Each rotation comes twice, with opposite normals.
+    return [
+        np.asarray(rotation)
+        for rotation, normal in zip(rotations, normals, strict=True)
+        if np.mean(normal.ravel() @ inliers.rays[0] > 0.0) >= _FRONT_SHARE
+    ]
+
+
+def _wrong_angle(
+    rotations: Sequence[_Floats], known: _Floats, rays: Sequence[_Floats]
+) -> float | None:
+    """Largest triangulation angle in degrees of rotations that contradict the known one."""
+    angles = [(_triangulation_angle(rotation, rays), rotation) for rotation in rotations]
+    return max(
+        (angle for angle, own in angles if _angle_between(own, known) > _WRONG * angle),
+        default=None,
+    )
 
 
 def _pose_of_essential(E: _Floats, inliers: _PairInliers) -> _Floats:

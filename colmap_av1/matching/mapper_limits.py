@@ -6,24 +6,10 @@ from dataclasses import dataclass
 
 # Fewest inliers of a pair that a mapper uses (min_num_matches).
 MIN_INLIERS = 15
-# Initial pair of the incremental mapper: fewest inliers (init_min_num_inliers), largest share of
-# the translation along the optical axis (init_max_forward_motion), smallest triangulation angle in
-# degrees (init_min_tri_angle).
+# Initial pair of the incremental mapper, see `InitialLimits`.
 INITIAL_MIN_INLIERS = 100
 INITIAL_MAX_FORWARD_MOTION = 0.95
 INITIAL_MIN_ANGLE = 16.0
-# If no pair meets these limits, the mapper halves the number of inliers, then the angle, then both
-# once more in this order.
-RELAXED_INITIAL_LIMITS = tuple(
-    {"init_min_num_inliers": INITIAL_MIN_INLIERS // few, "init_min_tri_angle": angle}
-    for few, angle in (
-        (2, INITIAL_MIN_ANGLE),
-        (2, INITIAL_MIN_ANGLE / 2),
-        (4, INITIAL_MIN_ANGLE / 2),
-        (4, INITIAL_MIN_ANGLE / 4),
-    )
-)
-LOWER_INITIAL_LIMITS = RELAXED_INITIAL_LIMITS[1]
 # If no pair has 8 degrees either, the mapper halves the angle again. Before that, it tries hundreds
 # or thousands of pairs, and RANSAC may give one of them a wrong pose with a large angle.
 INITIAL_LEAST_ANGLE = INITIAL_MIN_ANGLE / 4
@@ -38,11 +24,13 @@ class InitialLimits:
     """Limits of the initial pair, by the names of the options of COLMAP's mapper.
 
     Attributes:
+        init_min_num_inliers: fewest inliers.
         init_max_forward_motion: largest share of the translation along the optical axis; 1 excludes
             no pair.
         init_min_tri_angle: smallest triangulation angle in degrees.
     """
 
+    init_min_num_inliers: int = INITIAL_MIN_INLIERS
     init_max_forward_motion: float = INITIAL_MAX_FORWARD_MOTION
     init_min_tri_angle: float = INITIAL_MIN_ANGLE
 
@@ -64,4 +52,15 @@ DEFAULT_LIMITS = InitialLimits()
 SMALL_ANGLES = InitialLimits(init_min_tri_angle=INITIAL_LEAST_ANGLE)
 # For videos in which the camera moves along its axis, as on a drive: all angles are small, and the
 # motion excludes no pair.
-FORWARD_MOTION = InitialLimits(1.0, INITIAL_LEAST_ANGLE)
+FORWARD_MOTION = InitialLimits(init_max_forward_motion=1.0, init_min_tri_angle=INITIAL_LEAST_ANGLE)
+# If no pair meets its limits, the mapper halves the number of inliers, then the angle, then both
+# once more in this order.
+RELAXED_LIMITS = tuple(
+    InitialLimits(init_min_num_inliers=INITIAL_MIN_INLIERS // few, init_min_tri_angle=angle)
+    for few, angle in (
+        (2, INITIAL_MIN_ANGLE),
+        (2, INITIAL_MIN_ANGLE / 2),
+        (4, INITIAL_MIN_ANGLE / 2),
+        (4, INITIAL_MIN_ANGLE / 4),
+    )
+)

@@ -25,6 +25,7 @@ from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.options import ReconstructOptions
 from colmap_av1.poses.mapper import ADJUSTMENT_STEPS, ADJUSTMENT_TOLERANCE, adjust_model
 from colmap_av1.poses.run import Run
+from colmap_av1.util.colmap_log import only_errors
 from colmap_av1.util.spread import evenly_spread
 
 # Scales of the robust loss in pixels. Half of the observations have errors below 0.3 to 0.4 px;
@@ -166,15 +167,10 @@ def focal_length_errors(model: PosedModel) -> dict[int, float]:
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = LOSS_SCALES[-1]
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
-    level = pycolmap.logging.minloglevel
-    # COLMAP warns if the covariance cannot be computed.
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    try:
+    with only_errors():  # COLMAP warns if the covariance cannot be computed
         covariance = pycolmap.estimate_ba_covariance(
             pycolmap.BACovarianceOptions(), found, adjuster
         )
-    finally:
-        pycolmap.logging.minloglevel = level
     errors = dict.fromkeys(model.cameras, math.inf)
     for number, camera in found.cameras.items():
         own = covariance.get_other_params_cov(camera.params) if covariance is not None else None

@@ -159,7 +159,6 @@ def start_mapper(
     *,
     log: Path,
     initial_pair: dict[str, float],
-    first_image: int | None = None,
 ) -> list[str] | None:
     """Run the incremental mapper on a database until its first model has a number of images.
 
@@ -169,8 +168,6 @@ def start_mapper(
         num_images: number of images at which the mapper is stopped.
         log: file for the output of the mapper.
         initial_pair: limits for the initial pair, in addition to the options.
-        first_image: id of an image of the initial pair; None: any. The mapper lowers its limits for
-            this image; if no model begins with it even then, any image is tried.
 
     Returns:
         Names of the images of a first model that remains smaller; None if it does not, or if the
@@ -180,7 +177,7 @@ def start_mapper(
         ModelError: the mapper failed; the log holds the details.
     """
     settings = _mapping_settings(database, database.parent, options, None)
-    settings |= {"task": "start", "num_images": num_images, "first_image": first_image}
+    settings |= {"task": "start", "num_images": num_images}
     settings["initial_pair"] = {**initial_pair, **settings["initial_pair"]}
     names: list[str] | None = None
 

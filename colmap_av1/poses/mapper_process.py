@@ -129,17 +129,10 @@ def _start(settings: dict[str, Any]) -> list[str] | None:
     output = Path(settings["model"]) / "start"
     output.mkdir(exist_ok=True)
     callbacks: Any = {"initial_image_pair_callback": start, "next_image_callback": go_on}
-    any_image = how.init_image_id1
-    given = settings["first_image"]
-    models = {}
     try:
-        for first_image in [any_image] if given is None else [given, any_image]:
-            how.init_image_id1 = first_image
-            models = pycolmap.incremental_mapping(
-                settings["database"], output, output, options=how, **callbacks
-            )
-            if models:
-                break
+        models = pycolmap.incremental_mapping(
+            settings["database"], output, output, options=how, **callbacks
+        )
     except _EnoughImagesError:
         return None
     if not models:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,8 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import PreparedStart, TrialStart, are_far, demoted
-from colmap_av1.matching.mapper_limits import FORWARD_MOTION, LOWER_INITIAL_LIMITS, SMALL_ANGLES
+from colmap_av1.matching.initial_pairs import PreparedStart, are_far, demoted
+from colmap_av1.matching.mapper_limits import FORWARD_MOTION, RELAXED_LIMITS
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
 from colmap_av1.util.run_context import RunContext
@@ -45,11 +44,8 @@ def demote_failing_starts(
 ) -> MatchedImages:
     """Limit the inliers of pairs with which COLMAP's incremental mapper starts a small model.
 
-    The mapper runs with one thread and the seed 0, with the options that `match` prints, and for
-    small angles also without them. Other seeds and versions mostly start alike. If no pair meets
-    the default limits of an initial pair, the first trial without options begins with the limits
-    and the image that are predicted, see `PreparedStart`. It does not show whether RANSAC would
-    give a pair a wrong pose that meets higher limits.
+    The mapper runs with one thread and the seed 0, with the options that `match` prints. Other
+    seeds, numbers of threads and versions often start alike.
 
     Args:
         start: the images, and the mapper's limits.
@@ -80,32 +76,17 @@ def demote_failing_starts(
         camera.has_prior_focal_length = True
     known = [copies[id(camera)] for camera in cameras]
 
-    def failing_start(trial: TrialStart, matched: MatchedImages) -> list[str] | None:
-        first_image = None
-        # After a demotion, the mapper may begin with another image.
-        if trial.first_image is not None and matched is start.matched:
-            first_image = trial.first_image + 1  # new databases number images from 1
+    lower = vars(RELAXED_LIMITS[1]) if not start.is_certain else {}
+    initial_pair = {**lower, **start.limits.options}
+
+    def failing_start(matched: MatchedImages) -> list[str] | None:
         with tempfile.TemporaryDirectory() as folder:
             database, log = Path(folder) / "matches.db", Path(folder) / "log"
             write_matched_images(database, names, known, matched)
-            return start_mapper(
-                database,
-                options,
-                num_images,
-                log=log,
-                initial_pair=trial.options,
-                first_image=first_image,
-            )
+            return start_mapper(database, options, num_images, log=log, initial_pair=initial_pair)
 
-    lower = {} if start.is_certain else LOWER_INITIAL_LIMITS
-    series = [TrialStart({**lower, **start.limits.options})]
-    if start.limits == SMALL_ANGLES:
-        series.append(start.without_options)
-    found = start.matched
     with context.clock.measure("verification"):
-        for trial in series:
-            found = _without_failing_starts(found, names, partial(failing_start, trial))
-    return found
+        return _without_failing_starts(start.matched, names, failing_start)
 
 
 def _without_failing_starts(

@@ -11,12 +11,11 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import TrialStart, prepare_start
+from colmap_av1.matching.initial_pairs import prepare_start
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
     INITIAL_MIN_INLIERS,
-    RELAXED_INITIAL_LIMITS,
     SMALL_ANGLES,
     InitialLimits,
 )
@@ -28,6 +27,8 @@ from colmap_av1.util.progress import Clock
 
 CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
 GUESSED = make_camera(CameraOptions(camera_model="SIMPLE_RADIAL"), WIDTH, HEIGHT)
+TURN = Rotation.from_euler("y", 20, degrees=True).as_matrix()
+TURNED = np.column_stack([TURN, [0, 0, 1] - TURN[:, 2]])
 PAIR = np.array([[0, 1]], dtype=np.int32)
 ANGLE = 6.0
 
@@ -151,16 +152,16 @@ def test_pair_with_a_wrong_pose_is_demoted(
 
 
 @pytest.mark.parametrize(
-    ("angle", "limits", "is_certain", "without_options"),
+    ("angle", "limits", "is_certain"),
     [
-        (30.0, DEFAULT_LIMITS, True, TrialStart({})),
-        (12.0, SMALL_ANGLES, True, TrialStart(RELAXED_INITIAL_LIMITS[1], 0)),
-        (6.0, SMALL_ANGLES, True, TrialStart(RELAXED_INITIAL_LIMITS[3], 0)),
-        (3.0, SMALL_ANGLES, False, TrialStart(RELAXED_INITIAL_LIMITS[1])),
+        (30.0, DEFAULT_LIMITS, True),
+        (12.0, SMALL_ANGLES, True),
+        (6.0, SMALL_ANGLES, True),
+        (3.0, DEFAULT_LIMITS, False),
     ],
 )
 def test_limits_depend_on_the_largest_angle(
-    angle: float, limits: InitialLimits, is_certain: bool, without_options: TrialStart
+    angle: float, limits: InitialLimits, is_certain: bool
 ) -> None:
     keypoints, matches = two_views(4.0, np.random.default_rng(0), 400, angle)
     geometry = verified(keypoints, matches)
@@ -170,7 +171,6 @@ def test_limits_depend_on_the_largest_angle(
     found = prepare_start(matched, [CAMERA] * 2, Clock(), [poses])
     assert found.limits == limits
     assert found.is_certain == is_certain
-    assert found.without_options == without_options
     assert found.matched.geometries[0] is geometry
 
 
@@ -219,37 +219,61 @@ def test_pair_with_few_inliers_is_demoted_if_no_pair_has_a_large_angle() -> None
     assert kept == [True, False, True]
 
 
-def test_pair_of_unknown_pose_is_demoted_if_the_mapper_would_try_it_first() -> None:
-    """An image outside the joint estimate belongs to no model that is known to grow."""
-    rng = np.random.default_rng(3)
-    views = [turned_views(0.5, 0.3, count, rng) for count in (300, 600)]
-    pairs = np.array([[0, 5], [6, 9]], dtype=np.int32)
+def kept(
+    views: list[tuple[list[ImageKeypoints], NDArray[np.uint32]]],
+    poses: list[NDArray[np.float64] | None],
+) -> list[bool]:
+    """Whether pairs of images keep their inliers, given the poses of their second images.
+
+    The images of a pair are no neighbours. With None, the pose of both images is unknown.
+    """
     nothing = np.empty((0, 2), np.float32)
-    keypoints = [ImageKeypoints(i, nothing, np.arange(0)) for i in range(10)]
-    for pair, (own, _) in zip(pairs.tolist(), views, strict=True):
+    keypoints = [ImageKeypoints(i, nothing, np.arange(0)) for i in range(8 * len(views))]
+    known: list[NDArray[np.float64] | None] = [None] * len(keypoints)
+    pairs = np.array([[8 * i, 8 * i + 4] for i in range(len(views))], dtype=np.int32)
+    for pair, (own, _), pose in zip(pairs.tolist(), views, poses, strict=True):
         keypoints[pair[0]], keypoints[pair[1]] = own
+        if pose is not None:
+            known[pair[0]], known[pair[1]] = np.eye(3, 4), pose
     geometries = [verified(*own) for own in views]
     matched = MatchedImages(
         keypoints, pairs, [g.inlier_matches for g in geometries], geometries, False
     )
-    turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
-    poses: list[NDArray[np.float64] | None] = [None] * 10
-    poses[0], poses[5] = np.eye(3, 4), np.column_stack([turn, [0, 0, 1] - turn[:, 2]])
-    found = prepare_start(matched, [CAMERA] * 10, Clock(), [poses])
-    kept = [a is b for a, b in zip(found.matched.geometries, geometries, strict=True)]
-    assert kept == [True, False]
+    found = prepare_start(matched, [CAMERA] * len(keypoints), Clock(), [known])
+    return [a is b for a, b in zip(found.matched.geometries, geometries, strict=True)]
 
 
-def test_mapper_without_options_begins_with_the_image_that_has_most_matches() -> None:
-    rng = np.random.default_rng(0)
-    views = [two_views(4.0, rng, count, 6.0) for count in (200, 400)]
-    geometries = [verified(*own) for own in views]
-    matched = MatchedImages(
-        [keypoints for own, _ in views for keypoints in own],
-        np.array([[0, 1], [2, 3]], dtype=np.int32),
-        [g.inlier_matches for g in geometries],
-        geometries,
-        False,
-    )
-    found = prepare_start(matched, [CAMERA] * 4, Clock())
-    assert found.without_options == TrialStart(RELAXED_INITIAL_LIMITS[3], 2)
+def test_pair_of_unknown_pose_is_demoted_if_the_mapper_would_try_it_first() -> None:
+    """An image outside the joint estimate belongs to no model that is known to grow."""
+    rng = np.random.default_rng(3)
+    views = [turned_views(0.5, 0.3, count, rng) for count in (300, 600)]
+    assert kept(views, [TURNED, None]) == [True, False]
+    assert kept(views, [TURNED, TURNED]) == [True, True]
+
+
+def test_pair_whose_intrinsics_diverge_is_demoted() -> None:
+    """Points in a small part of the picture do not determine the focal length."""
+    rng = np.random.default_rng(3)
+    views = [turned_views(*shape, rng) for shape in ((0.5, 0.3, 300), (0.1, 0.02, 600))]
+    assert kept(views, [TURNED, TURNED]) == [True, False]
+
+
+def test_pair_with_two_possible_poses_is_demoted() -> None:
+    """The mapper takes the motion towards a wall for a turn, with twice the angle."""
+    rng = np.random.default_rng(3)
+    good = turned_views(0.5, 0.3, 300, rng)
+    x = rng.uniform((-0.4, -0.3), (0.4, 0.3), (600, 2))
+    wall = np.c_[x, np.ones(600)] / (1 + 1.5 * x[:, :1])
+    step = np.array([-0.16, 0.02, -0.16])
+    keypoints = [
+        ImageKeypoints(
+            frame,
+            (CAMERA.img_from_cam(points) + rng.normal(0, 0.1, (600, 2))).astype(np.float32),
+            np.arange(600),
+        )
+        for frame, points in enumerate((wall, wall + step))
+    ]
+    matches = np.repeat(np.arange(600, dtype=np.uint32)[:, None], 2, axis=1)
+    assert angle_of_mapper(keypoints, matches) > 16.0
+    moved = np.column_stack([np.eye(3), step])
+    assert kept([good, (keypoints, matches)], [TURNED, moved]) == [True, False]

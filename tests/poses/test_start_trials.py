@@ -15,12 +15,11 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, make_scene, match_scen
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import PreparedStart, TrialStart
+from colmap_av1.matching.initial_pairs import PreparedStart
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS, INITIAL_MIN_INLIERS
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.verify import verify_pairs
-from colmap_av1.options import CameraOptions, MapOptions
-from colmap_av1.poses.mapper import start_mapper
+from colmap_av1.options import CameraOptions
 from colmap_av1.poses.start_trials import demote_failing_starts
 from colmap_av1.util.run_context import RunContext
 
@@ -92,7 +91,7 @@ def num_registered(matched: MatchedImages, folder: Path) -> list[int]:
 
 
 def prepared(matched: MatchedImages) -> PreparedStart:
-    return PreparedStart(matched, DEFAULT_LIMITS, is_certain=True, without_options=TrialStart({}))
+    return PreparedStart(matched, DEFAULT_LIMITS, is_certain=True)
 
 
 def test_pair_from_which_no_model_grows_is_demoted(
@@ -122,22 +121,3 @@ def test_pairs_keep_their_inliers_if_no_start_succeeds(with_moving_object: Match
     start = prepared(alone)
     found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, RunContext())
     assert found.geometries == alone.geometries
-
-
-def test_given_first_image_is_tried_before_any_other(
-    with_moving_object: MatchedImages, tmp_path: Path
-) -> None:
-    nothing = ImageKeypoints(NUM_IMAGES, np.empty((0, 2), np.float32), np.arange(0))
-    matched = replace(with_moving_object, keypoints=[*with_moving_object.keypoints, nothing])
-    database = tmp_path / "a.db"
-    write_matched_images(database, [*NAMES, "without_matches.jpg"], CAMERA, matched)
-    options = MapOptions(mapper="incremental", seed=0, num_threads=1)
-    any_image, first, without_matches = (
-        start_mapper(
-            database, options, 10, log=tmp_path / "log", initial_pair={}, first_image=first_image
-        )
-        for first_image in (None, 1, NUM_IMAGES + 1)
-    )
-    assert any_image is not None
-    assert first is None  # the first image does not show the moving object
-    assert without_matches == any_image
