@@ -298,6 +298,21 @@ def test_database_is_written_although_the_mapper_crashes(
     assert len(read_images(tmp_path / "a.db")) == report.num_images
 
 
+def test_mapper_is_not_tried_if_the_camera_only_turns(
+    encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*args: object, **options: object) -> None:
+        pytest.fail("the mapper was tried")
+
+    monkeypatch.setattr("colmap_av1.poses.start_trials.start_mapper", fail)
+    wall = np.random.default_rng(5).integers(0, 256, (60, 120, 3), dtype=np.uint8)
+    wall = cv2.resize(wall, (480, 240))
+    frames = np.stack([wall[:, 5 * i : 5 * i + 320] for i in range(16)])
+    report = match(tmp_path / "a.db", encode(frames, tmp_path / "turning.mp4"))
+    assert report.num_verified_pairs > 0
+    assert any("not observable" in warning for warning in report.warnings)
+
+
 def test_locked_database_is_reported_and_not_changed(clip: Path, tmp_path: Path) -> None:
     match(tmp_path / "a.db", clip)
     connection = sqlite3.connect(tmp_path / "a.db", isolation_level=None)
