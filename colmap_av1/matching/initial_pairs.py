@@ -293,18 +293,17 @@ class _Search:
     ) -> tuple[set[int], bool]:
         """Pairs that the mapper may find before it finds a good one.
 
-        A pair is good if its pose is right, as far as is known, a large model grows from it, and
-        the mapper does not fail to begin with it. If the limits are not the default ones, it must
-        also meet them with certainty: RANSAC may get a pose wrong if the angle is only a few
-        degrees.
+        A pair is good if its pose is known and right, the mapper begins well with it, and a large
+        model grows from it. If the limits are not the default ones, it must also meet them with
+        certainty: RANSAC may get a pose wrong if the angle is only a few degrees.
 
         Args:
             limits: the limits of the initial pair.
             demoted: indices of pairs that are demoted.
 
         Returns:
-            Indices of bad pairs, including the demoted ones; neighbours only if the mapper fails
-            with them. Whether a good pair certainly meets the limits.
+            Indices of bad pairs, including the demoted ones; neighbours only if the mapper begins
+            badly with them. Whether a good pair certainly meets the limits.
         """
         found = self._found
         certain, possible = found.certain(limits), found.possible(limits)
@@ -324,15 +323,18 @@ class _Search:
                         break
                     if rank[i] == rank[first] or place[i] > 2 * place[first] + _NUM_AHEAD:
                         continue
-                if not (is_sound[k] and self._is_large(k)):
-                    if found.is_far[k]:
+                if is_sound[k]:
+                    has_begun = self._begins(k, limits)
+                    if has_begun is None:
+                        continue  # the mapper rejects the pair
+                    if has_begun and self._is_large(k):
+                        if certain[k] and first is None:
+                            first = i
+                        continue
+                    if not has_begun:
                         bad.add(k)
-                    continue
-                has_begun = self._begins(k, limits)
-                if has_begun is False:
+                if found.is_far[k]:
                     bad.add(k)
-                elif has_begun and certain[k] and first is None:
-                    first = i
             if first is None or len(bad) == num_before:
                 return bad, first is not None
 
