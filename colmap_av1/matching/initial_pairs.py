@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -17,6 +17,7 @@ from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
+    INITIAL_LEAST_ANGLE,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
     RELAXED_LIMITS,
@@ -33,6 +34,8 @@ _Floats = NDArray[np.float64]
 # If no pair meets the mapper's limits for an initial pair, it halves the number of inliers, then
 # the angle.
 _MIN_INLIERS = INITIAL_MIN_INLIERS // 2
+# In the end, it has halved both twice, the angle perhaps from that of `SMALL_ANGLES`.
+_LEAST_INLIERS, _LEAST_ANGLE = INITIAL_MIN_INLIERS // 4, INITIAL_LEAST_ANGLE / 4
 # The mapper estimates poses anew. It certainly accepts a pair that exceeds its limits by this
 # factor.
 _MARGIN = 1.1
@@ -107,6 +110,9 @@ def prepare_start(
     may give any of them a wrong pose with a large angle. With known poses, these pairs are demoted,
     too, except neighbours, which connect the images.
 
+    If poses are known of several models, the mapper begins again and again. Pairs of which it finds
+    a wrong pose then keep fewer inliers than it ever accepts.
+
     Args:
         matched: the images. The pose of the homography is tested only for pairs with an essential
             matrix, which needs known focal lengths.
@@ -117,6 +123,11 @@ def prepare_start(
     """
     with clock.measure("verification"):
         found = _Candidates.of(matched, cameras, known)
+        if len(known) > 1:
+            # For each further model, the mapper lowers its limits until it finds a pair.
+            is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * _LEAST_ANGLE)
+            matched = _with_demoted(matched, np.flatnonzero(is_bad), _LEAST_INLIERS - 1)
+            found = replace(found, count=_num_inliers(matched))
         limits = FORWARD_MOTION if matched.forward_motion else DEFAULT_LIMITS
         demote = set[int]()
         if known:
@@ -139,19 +150,37 @@ def prepare_start(
             lowest_angle = max(lowest_angle, INITIAL_MIN_ANGLE / 2)
         is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * lowest_angle)
         demote |= set(np.flatnonzero(is_bad).tolist())
-        geometries = list(matched.geometries)
-        for k in demote:
-            geometries[k] = demoted(geometries[k])
-    return PreparedStart(replace(matched, geometries=geometries), limits, is_certain)
+    return PreparedStart(_with_demoted(matched, demote), limits, is_certain)
 
 
-def demoted(geometry: TwoViewGeometry) -> TwoViewGeometry:
-    """Keep some of the inliers, evenly spread, too few until the mapper lowers its limits twice."""
+def demoted(geometry: TwoViewGeometry, most: int = _MIN_INLIERS - 1) -> TwoViewGeometry:
+    """Keep some of the inliers, evenly spread.
+
+    Args:
+        geometry: geometry of a pair.
+        most: largest number of inliers. With the default, there are too few until the mapper lowers
+            its limits twice.
+    """
     count = len(geometry.inlier_matches)
-    if count < _MIN_INLIERS:
+    if count <= most:
         return geometry
-    chosen = evenly_spread(count, _MIN_INLIERS - 1, rounded=True)
+    chosen = evenly_spread(count, most, rounded=True)
     return replace(geometry, inlier_matches=geometry.inlier_matches[chosen])
+
+
+def _with_demoted(
+    matched: MatchedImages, which: Iterable[int], most: int = _MIN_INLIERS - 1
+) -> MatchedImages:
+    """Limit the inliers of some pairs, given by their indices, see `demoted`."""
+    geometries = list(matched.geometries)
+    for k in which:
+        geometries[k] = demoted(geometries[k], most)
+    return replace(matched, geometries=geometries)
+
+
+def _num_inliers(matched: MatchedImages) -> NDArray[np.int64]:
+    """Number of inliers of each pair, int64 [num_pairs]."""
+    return np.array([len(own.inlier_matches) for own in matched.geometries], np.int64)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from colmap_av1.matching.initial_pairs import prepare_start
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
+    INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
     SMALL_ANGLES,
     InitialLimits,
@@ -29,6 +30,7 @@ CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
 GUESSED = make_camera(CameraOptions(camera_model="SIMPLE_RADIAL"), WIDTH, HEIGHT)
 TURN = Rotation.from_euler("y", 20, degrees=True).as_matrix()
 TURNED = np.column_stack([TURN, [0, 0, 1] - TURN[:, 2]])
+TOWARDS = np.column_stack([np.eye(3), [-0.16, 0.02, -0.16]])
 PAIR = np.array([[0, 1]], dtype=np.int32)
 ANGLE = 6.0
 
@@ -219,61 +221,77 @@ def test_pair_with_few_inliers_is_demoted_if_no_pair_has_a_large_angle() -> None
     assert kept == [True, False, True]
 
 
-def kept(
+def num_inliers(
     views: list[tuple[list[ImageKeypoints], NDArray[np.uint32]]],
     poses: list[NDArray[np.float64] | None],
-) -> list[bool]:
-    """Whether pairs of images keep their inliers, given the poses of their second images.
+    *,
+    apart: bool = False,
+) -> list[int]:
+    """Number of inliers that each pair of images keeps, given the poses of their second images.
 
-    The images of a pair are no neighbours. With None, the pose of both images is unknown.
+    The images of a pair are no neighbours. With None, the pose of both images is unknown. The
+    images are in one model, or each pair is in its own.
     """
     nothing = np.empty((0, 2), np.float32)
     keypoints = [ImageKeypoints(i, nothing, np.arange(0)) for i in range(8 * len(views))]
-    known: list[NDArray[np.float64] | None] = [None] * len(keypoints)
+    known: list[list[NDArray[np.float64] | None]] = [
+        [None] * len(keypoints) for _ in range(len(views) if apart else 1)
+    ]
     pairs = np.array([[8 * i, 8 * i + 4] for i in range(len(views))], dtype=np.int32)
-    for pair, (own, _), pose in zip(pairs.tolist(), views, poses, strict=True):
-        keypoints[pair[0]], keypoints[pair[1]] = own
+    for i, ((own, _), pose) in enumerate(zip(views, poses, strict=True)):
+        first, second = pairs[i].tolist()
+        keypoints[first], keypoints[second] = own
         if pose is not None:
-            known[pair[0]], known[pair[1]] = np.eye(3, 4), pose
+            model = known[i if apart else 0]
+            model[first], model[second] = np.eye(3, 4), pose
     geometries = [verified(*own) for own in views]
     matched = MatchedImages(
         keypoints, pairs, [g.inlier_matches for g in geometries], geometries, False
     )
-    found = prepare_start(matched, [CAMERA] * len(keypoints), Clock(), [known])
-    return [a is b for a, b in zip(found.matched.geometries, geometries, strict=True)]
+    found = prepare_start(matched, [CAMERA] * len(keypoints), Clock(), known)
+    return [len(geometry.inlier_matches) for geometry in found.matched.geometries]
 
 
-def test_pair_of_unknown_pose_is_demoted_if_the_mapper_would_try_it_first() -> None:
-    """An image outside the joint estimate belongs to no model that is known to grow."""
-    rng = np.random.default_rng(3)
-    views = [turned_views(0.5, 0.3, count, rng) for count in (300, 600)]
-    assert kept(views, [TURNED, None]) == [True, False]
-    assert kept(views, [TURNED, TURNED]) == [True, True]
-
-
-def test_pair_whose_intrinsics_diverge_is_demoted() -> None:
-    """Points in a small part of the picture do not determine the focal length."""
-    rng = np.random.default_rng(3)
-    views = [turned_views(*shape, rng) for shape in ((0.5, 0.3, 300), (0.1, 0.02, 600))]
-    assert kept(views, [TURNED, TURNED]) == [True, False]
-
-
-def test_pair_with_two_possible_poses_is_demoted() -> None:
-    """The mapper takes the motion towards a wall for a turn, with twice the angle."""
-    rng = np.random.default_rng(3)
-    good = turned_views(0.5, 0.3, 300, rng)
+def towards_a_wall(rng: np.random.Generator) -> tuple[list[ImageKeypoints], NDArray[np.uint32]]:
+    """Two views of a wall, for which the mapper finds a wrong pose."""
     x = rng.uniform((-0.4, -0.3), (0.4, 0.3), (600, 2))
     wall = np.c_[x, np.ones(600)] / (1 + 1.5 * x[:, :1])
-    step = np.array([-0.16, 0.02, -0.16])
     keypoints = [
         ImageKeypoints(
             frame,
             (CAMERA.img_from_cam(points) + rng.normal(0, 0.1, (600, 2))).astype(np.float32),
             np.arange(600),
         )
-        for frame, points in enumerate((wall, wall + step))
+        for frame, points in enumerate((wall, wall + TOWARDS[:, 3]))
     ]
-    matches = np.repeat(np.arange(600, dtype=np.uint32)[:, None], 2, axis=1)
-    assert angle_of_mapper(keypoints, matches) > 16.0
-    moved = np.column_stack([np.eye(3), step])
-    assert kept([good, (keypoints, matches)], [TURNED, moved]) == [True, False]
+    return keypoints, np.repeat(np.arange(600, dtype=np.uint32)[:, None], 2, axis=1)
+
+
+def test_pair_of_unknown_pose_is_demoted_if_the_mapper_would_try_it_first() -> None:
+    """An image outside the joint estimate belongs to no model that is known to grow."""
+    rng = np.random.default_rng(3)
+    views = [turned_views(0.5, 0.3, count, rng) for count in (300, 600)]
+    assert num_inliers(views, [TURNED, None]) == [300, INITIAL_MIN_INLIERS // 2 - 1]
+    assert num_inliers(views, [TURNED, TURNED]) == [300, 600]
+
+
+def test_pair_whose_intrinsics_diverge_is_demoted() -> None:
+    """Points in a small part of the picture do not determine the focal length."""
+    rng = np.random.default_rng(3)
+    views = [turned_views(*shape, rng) for shape in ((0.5, 0.3, 300), (0.1, 0.02, 600))]
+    assert num_inliers(views, [TURNED, TURNED]) == [300, INITIAL_MIN_INLIERS // 2 - 1]
+
+
+@pytest.mark.parametrize(
+    ("apart", "count"),
+    [(False, INITIAL_MIN_INLIERS // 2 - 1), (True, INITIAL_MIN_INLIERS // 4 - 1)],
+)
+def test_pair_with_two_possible_poses_is_demoted(apart: bool, count: int) -> None:
+    """The mapper takes the motion towards a wall for a turn, with twice the angle.
+
+    A pair of a further model is demoted below the lowest limit.
+    """
+    rng = np.random.default_rng(3)
+    views = [turned_views(0.5, 0.3, 300, rng), towards_a_wall(rng)]
+    assert angle_of_mapper(*views[1]) > INITIAL_MIN_ANGLE
+    assert num_inliers(views, [TURNED, TOWARDS], apart=apart) == [300, count]
