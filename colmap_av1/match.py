@@ -282,10 +282,8 @@ def match(
         names = images.image_set.images.names
         crash = None
         try:
-            # With known poses, the mapper's start has been tried with each pair that it may take.
             # Without depth, there is no good start.
-            is_tried = bool(known) and start.is_certain
-            if found.depth.is_observable and not is_tried:
+            if found.depth.is_observable and not start.is_tried:
                 written = demote_failing_starts(
                     start, names, found.cameras, context, fixed_intrinsics=fixed_intrinsics
                 )

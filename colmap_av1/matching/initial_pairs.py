@@ -11,9 +11,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.matching.first_images import first_images
 from colmap_av1.matching.growth import Growth
 from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.initial_pair_trial import try_initial_pair
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
@@ -41,17 +41,17 @@ _LEAST_INLIERS, _LEAST_ANGLE = INITIAL_MIN_INLIERS // 4, INITIAL_LEAST_ANGLE / 4
 _MARGIN = 1.1
 # It may accept a pair with this share of the angle that it requires.
 _WIDE_SHARE = 0.75
-# The share of the translation along the optical axis differs by less than this.
+# Tolerance of the translation along the optical axis, which the mapper estimates anew.
 _ALONG_MARGIN = 0.02
 # A model is large if it has this share of the images of the largest model that grows from any of
 # this many pairs.
 _LARGE = 0.8
 _NUM_GROWN = 16
-# A mapper with several threads tries up to this many images at a time. With some, it may have tried
-# twice as many pairs as with the first one, and this many more.
+# With several threads, the mapper tries the pairs of up to 16 images at a time. When it accepts the
+# n-th pair of one image, it may have tried 2 n + 4 pairs of another.
 _NUM_THREADS, _NUM_AHEAD = 16, 4
 # Neighbours are at most this many images apart. They connect the images, and are only demoted if
-# their pose is wrong, or if the mapper fails with them in a trial, see `demote_failing_starts`.
+# their pose is wrong, or if the mapper begins badly with them.
 NEIGHBOURS = 2
 # About this many inliers decide as well as all of them.
 _NUM_SOME = 64
@@ -78,11 +78,13 @@ class PreparedStart:
         matched: the images. Pairs that would be a bad initial pair have fewer inliers.
         limits: the limits of the initial pair that the mapper needs.
         is_certain: a pair certainly meets these limits. If not, the mapper may have to lower them.
+        is_tried: the mapper begins well with the pair that it finds first, as trials have shown.
     """
 
     matched: MatchedImages
     limits: InitialLimits
     is_certain: bool
+    is_tried: bool
 
 
 def prepare_start(
@@ -96,8 +98,8 @@ def prepare_start(
     COLMAP's mapper takes a pair's pose from its homography if that explains most of the matches
     (`EstimateTwoViewGeometryPose`). If the matches or known poses contradict the pose, a model that
     begins with the pair fails after a few images, and the mapper still writes it first. The same
-    happens if the mapper finds another pose, or if the intrinsics diverge, see `first_images`. A
-    demoted pair keeps enough inliers to connect its images; tracks continue through the pairs
+    happens if the mapper finds another pose, or if the intrinsics diverge, see `try_initial_pair`.
+    A demoted pair keeps enough inliers to connect its images; tracks continue through the pairs
     between. A bad pair is not demoted if the mapper finds a good pair first.
 
     Known poses also show with which limits the mapper begins with a pair that grows to the largest
@@ -106,12 +108,12 @@ def prepare_start(
     the time, but not always. Pairs that are worse, or whose pose is not known, and that the mapper
     would find earlier are demoted, except neighbours.
 
-    If no pair meets the default limits, the mapper tries hundreds of pairs with few inliers. RANSAC
-    may give any of them a wrong pose with a large angle. With known poses, these pairs are demoted,
-    too, except neighbours, which connect the images.
+    If the limits are not the default ones, the mapper without options tries hundreds of pairs with
+    few inliers. RANSAC may give any of them a wrong pose with a large angle. These pairs are
+    demoted, too, except neighbours, which connect the images.
 
-    If poses are known of several models, the mapper begins again and again. Pairs of which it finds
-    a wrong pose then keep fewer inliers than it ever accepts.
+    If poses are known of several models, the mapper begins several times, and pairs with a wrong
+    pose keep fewer inliers than it ever accepts.
 
     Args:
         matched: the images. The pose of the homography is tested only for pairs with an essential
@@ -124,12 +126,12 @@ def prepare_start(
     with clock.measure("verification"):
         found = _Candidates.of(matched, cameras, known)
         if len(known) > 1:
-            # For each further model, the mapper lowers its limits until it finds a pair.
+            # The mapper lowers its limits for the images that its first models leave.
             is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * _LEAST_ANGLE)
             matched = _with_demoted(matched, np.flatnonzero(is_bad), _LEAST_INLIERS - 1)
             found = replace(found, count=_num_inliers(matched))
         limits = FORWARD_MOTION if matched.forward_motion else DEFAULT_LIMITS
-        demote = set[int]()
+        demote, is_tried = set[int](), False
         if known:
             search = _Search(matched, cameras, found, Growth(matched, cameras, known))
             certain_limits, demote = search.first_certain()
@@ -137,9 +139,10 @@ def prepare_start(
             limits = certain_limits or limits
             if limits != DEFAULT_LIMITS:
                 has_few = found.is_far & (found.count < _MARGIN * INITIAL_MIN_INLIERS)
-                demote |= set(np.flatnonzero(has_few & ~np.isnan(found.angle)).tolist())
+                demote |= set(np.flatnonzero(has_few).tolist())
             if limits == SMALL_ANGLES:
-                demote = search.bad_pairs_without_options(demote)
+                demote = search.bad_pairs_with_relaxed_limits(demote)
+            is_tried = is_certain and not search.has_zoom
         else:
             is_certain = bool(found.certain(limits).any())
         lowest_angle = limits.init_min_tri_angle
@@ -150,7 +153,7 @@ def prepare_start(
             lowest_angle = max(lowest_angle, INITIAL_MIN_ANGLE / 2)
         is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * lowest_angle)
         demote |= set(np.flatnonzero(is_bad).tolist())
-    return PreparedStart(_with_demoted(matched, demote), limits, is_certain)
+    return PreparedStart(_with_demoted(matched, demote), limits, is_certain, is_tried)
 
 
 def demoted(geometry: TwoViewGeometry, most: int = _MIN_INLIERS - 1) -> TwoViewGeometry:
@@ -158,8 +161,8 @@ def demoted(geometry: TwoViewGeometry, most: int = _MIN_INLIERS - 1) -> TwoViewG
 
     Args:
         geometry: geometry of a pair.
-        most: largest number of inliers. With the default, there are too few until the mapper lowers
-            its limits twice.
+        most: largest number of inliers. With the default, there are too few until the mapper halves
+            their number twice.
     """
     count = len(geometry.inlier_matches)
     if count <= most:
@@ -199,8 +202,8 @@ class _Candidates:
         is_sound: bool [num_pairs] whether nothing contradicts the pose. If poses of images are
             known, that of the pair must be.
         is_far: bool [num_pairs] whether the images are no neighbours.
-        pose: for each pair, float64 [3, 4] pose of the second image relative to the first, the
-            known one if there is one; None if the pair has no angle.
+        known_pose: for each pair, float64 [3, 4] pose of the second image relative to the first;
+            None if it is not known.
     """
 
     count: NDArray[np.int64]
@@ -210,7 +213,7 @@ class _Candidates:
     is_wrong: NDArray[np.bool_]
     is_sound: NDArray[np.bool_]
     is_far: NDArray[np.bool_]
-    pose: list[_Floats | None]
+    known_pose: list[_Floats | None]
 
     @staticmethod
     def of(
@@ -233,7 +236,7 @@ class _Candidates:
                 continue
             angle[k], along[k] = _triangulation_angle(pose[:, :3], some.rays), abs(pose[2, 3])
             known_pose = _known_pose(known, pair)
-            poses[k] = pose if known_pose is None else known_pose
+            poses[k] = known_pose
             if known_pose is not None:
                 known_along[k] = abs(known_pose[2, 3])
             wrong_angle = _contradicted_angle(geometry, some)
@@ -270,6 +273,9 @@ class _Search:
         cameras: the camera of each image.
         found: what is known of the pairs.
         growth: the growth of models.
+
+    Attributes:
+        has_zoom: whether a pair has two cameras and was not tried.
     """
 
     def __init__(
@@ -281,6 +287,7 @@ class _Search:
     ) -> None:
         self._matched, self._cameras, self._found = matched, cameras, found
         self._growth = growth
+        self.has_zoom = False
         self._known_large = dict[int, bool]()
         self._known_begun = dict[tuple[int, InitialLimits], bool | None]()
         some = np.flatnonzero(found.certain(FORWARD_MOTION))
@@ -301,8 +308,10 @@ class _Search:
                     return limits, bad
         return None, set()
 
-    def bad_pairs_without_options(self, demoted: set[int]) -> set[int]:
-        """Pairs that the mapper may find before a good one while it lowers its limits by itself.
+    def bad_pairs_with_relaxed_limits(self, demoted: set[int]) -> set[int]:
+        """Pairs that the mapper without options may find before a good one.
+
+        It lowers its default limits until it finds a pair.
 
         Args:
             demoted: indices of pairs that are demoted.
@@ -331,8 +340,8 @@ class _Search:
             demoted: indices of pairs that are demoted.
 
         Returns:
-            Indices of bad pairs, including the demoted ones; neighbours only if the mapper begins
-            badly with them. Whether a good pair certainly meets the limits.
+            Indices of bad pairs, including the demoted ones; neighbours only if their pose is wrong
+            or the mapper begins badly with them. Whether a good pair certainly meets the limits.
         """
         found = self._found
         certain, possible = found.certain(limits), found.possible(limits)
@@ -362,7 +371,7 @@ class _Search:
                         continue
                     if not has_begun:
                         bad.add(k)
-                if found.is_far[k]:
+                if found.is_far[k] or found.is_wrong[k]:
                     bad.add(k)
             if first is None or len(bad) == num_before:
                 return bad, first is not None
@@ -403,20 +412,21 @@ class _Search:
 
     def _begins_in_trial(self, k: int, limits: InitialLimits) -> bool | None:
         first, second = pair = self._matched.pairs[k].tolist()
-        camera, pose = self._cameras[first], self._found.pose[k]
+        camera, pose = self._cameras[first], self._found.known_pose[k]
         assert pose is not None
-        # With a zoom, each image has its own camera, and two images determine neither.
+        # With a zoom, each image has its own camera. The mapper's first adjustment diverges then,
+        # and most models grow nevertheless.
         if camera is not self._cameras[second]:
+            self.has_zoom = True
             return True
         inliers = self._matched.geometries[k].inlier_matches.T
         xy = [
             self._matched.keypoints[image].xy[own] for image, own in zip(pair, inliers, strict=True)
         ]
-        begun = first_images(xy, camera, limits)
+        begun = try_initial_pair(xy, camera, limits, refine_intrinsics=limits != FORWARD_MOTION)
         if begun is None:
             return None
-        # With forward motion, the mapper keeps the intrinsics.
-        if begun.diverged and limits != FORWARD_MOTION:
+        if begun.diverged:
             return False
         turned = _angle_between(begun.cam2_from_cam1[:, :3], pose[:, :3])
         return bool(turned <= _WRONG * max(limits.init_min_tri_angle, self._found.angle[k]))

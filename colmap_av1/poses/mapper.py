@@ -170,8 +170,8 @@ def start_mapper(
         initial_pair: limits for the initial pair, in addition to the options.
 
     Returns:
-        Names of the images of a first model that remains smaller; None if it does not, or if the
-        mapper starts none.
+        Names of the images of a first model that remains smaller, none if the mapper starts none;
+        None if the model has enough images.
 
     Raises:
         ModelError: the mapper failed; the log holds the details.

@@ -136,7 +136,7 @@ def _start(settings: dict[str, Any]) -> list[str] | None:
     except _EnoughImagesError:
         return None
     if not models:
-        return None
+        return []
     return [image.name for image in models[0].images.values() if image.has_pose]
 
 

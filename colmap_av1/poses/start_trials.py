@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pairs import PreparedStart, are_far, demoted
-from colmap_av1.matching.mapper_limits import FORWARD_MOTION, RELAXED_LIMITS
+from colmap_av1.matching.mapper_limits import RELAXED_LIMITS
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
 from colmap_av1.util.run_context import RunContext
@@ -44,8 +44,9 @@ def demote_failing_starts(
 ) -> MatchedImages:
     """Limit the inliers of pairs with which COLMAP's incremental mapper starts a small model.
 
-    The mapper runs with one thread and the seed 0, with the options that `match` prints. Other
-    seeds, numbers of threads and versions often start alike.
+    The mapper runs with one thread and the seed 0, with the options that `match` prints. If no pair
+    certainly meets its limits, it begins with lower ones, since it would try all pairs before it
+    lowers them. Other seeds, numbers of threads and versions often start alike.
 
     Args:
         start: the images, and the mapper's limits.
@@ -64,7 +65,6 @@ def demote_failing_starts(
     num_images = max(_LEAST_IMAGES, min(_NUM_IMAGES, most))
     options = MapOptions(
         mapper="incremental",
-        forward_motion=start.limits == FORWARD_MOTION,
         refine_intrinsics=not fixed_intrinsics,
         seed=0,
         num_threads=1,
@@ -109,6 +109,8 @@ def _without_failing_starts(
         failed = failing_start(found)
         if failed is None:
             return found
+        if not failed:
+            break  # the mapper finds no initial pair
         images = [names.index(name) for name in failed]
         is_in = np.asarray(np.isin(matched.pairs, images).all(axis=1))
         # Neighbours connect the images, so they are demoted only if no other pair is left.

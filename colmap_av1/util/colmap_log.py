@@ -12,7 +12,7 @@ import pycolmap
 def only_errors() -> Iterator[None]:
     """Within the context, COLMAP logs nothing but errors."""
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    pycolmap.logging.minloglevel = max(level, int(pycolmap.logging.ERROR))
     try:
         yield
     finally:

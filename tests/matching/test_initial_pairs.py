@@ -27,7 +27,6 @@ from colmap_av1.options import CameraOptions
 from colmap_av1.util.progress import Clock
 
 CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
-GUESSED = make_camera(CameraOptions(camera_model="SIMPLE_RADIAL"), WIDTH, HEIGHT)
 TURN = Rotation.from_euler("y", 20, degrees=True).as_matrix()
 TURNED = np.column_stack([TURN, [0, 0, 1] - TURN[:, 2]])
 TOWARDS = np.column_stack([np.eye(3), [-0.16, 0.02, -0.16]])
@@ -62,7 +61,7 @@ def turned_views(
     moved = (points - [0, 0, 1]) @ turn.T + [0, 0, 1]
     keypoints = []
     for frame, seen in enumerate((points, moved)):
-        xy = GUESSED.img_from_cam(seen) + rng.normal(0, 0.3, (count, 2))
+        xy = CAMERA.img_from_cam(seen) + rng.normal(0, 0.3, (count, 2))
         keypoints.append(ImageKeypoints(frame, xy.astype(np.float32), np.arange(count)))
     own = np.arange(count, dtype=np.uint32)
     return keypoints, np.c_[own, own]

@@ -91,7 +91,7 @@ def num_registered(matched: MatchedImages, folder: Path) -> list[int]:
 
 
 def prepared(matched: MatchedImages) -> PreparedStart:
-    return PreparedStart(matched, DEFAULT_LIMITS, is_certain=True)
+    return PreparedStart(matched, DEFAULT_LIMITS, is_certain=True, is_tried=False)
 
 
 def test_pair_from_which_no_model_grows_is_demoted(

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.matching.first_images import first_images
+from colmap_av1.matching.initial_pair_trial import try_initial_pair
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS, SMALL_ANGLES
 from colmap_av1.options import CameraOptions
 
@@ -30,24 +30,24 @@ def two_views(
 
 def test_pose_is_that_of_the_images() -> None:
     xy, turn = two_views(0.5, 0.3, 20.0)
-    found = first_images(xy, CAMERA, DEFAULT_LIMITS)
+    found = try_initial_pair(xy, CAMERA, DEFAULT_LIMITS)
     assert found is not None
     assert not found.diverged
     assert found.cam2_from_cam1[:, :3] == pytest.approx(turn, abs=0.02)
 
 
 def test_intrinsics_diverge_if_the_points_fill_a_small_part_of_the_image() -> None:
-    found = first_images(two_views(0.1, 0.02, 20.0)[0], CAMERA, DEFAULT_LIMITS)
+    found = try_initial_pair(two_views(0.1, 0.02, 20.0)[0], CAMERA, DEFAULT_LIMITS)
     assert found is not None
     assert found.diverged
 
 
 def test_no_model_begins_below_the_limits() -> None:
     xy, _ = two_views(0.5, 0.3, 10.0)
-    assert first_images(xy, CAMERA, DEFAULT_LIMITS) is None
-    assert first_images(xy, CAMERA, SMALL_ANGLES) is not None
+    assert try_initial_pair(xy, CAMERA, DEFAULT_LIMITS) is None
+    assert try_initial_pair(xy, CAMERA, SMALL_ANGLES) is not None
 
 
 def test_log_stays_silent(capfd: pytest.CaptureFixture[str]) -> None:
-    first_images(two_views(0.5, 0.3, 20.0)[0], CAMERA, DEFAULT_LIMITS)
+    try_initial_pair(two_views(0.5, 0.3, 20.0)[0], CAMERA, DEFAULT_LIMITS)
     assert capfd.readouterr() == ("", "")

@@ -1,4 +1,4 @@
-"""The first steps of COLMAP's incremental mapper, with two images alone."""
+"""Try the first steps of COLMAP's incremental mapper with an initial pair."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _NUM_SEEDS = 3
 
 
 @dataclass(frozen=True)
-class FirstImages:
-    """The first two images of a model.
+class InitialPairTrial:
+    """The model of an initial pair.
 
     Attributes:
         cam2_from_cam1: float64 [3, 4] pose of the second image.
@@ -33,10 +33,14 @@ class FirstImages:
     diverged: bool
 
 
-def first_images(
-    xy: Sequence[NDArray[np.float32]], camera: pycolmap.Camera, limits: InitialLimits
-) -> FirstImages | None:
-    """Begin to map with two images as COLMAP's incremental mapper does.
+def try_initial_pair(
+    xy: Sequence[NDArray[np.float32]],
+    camera: pycolmap.Camera,
+    limits: InitialLimits,
+    *,
+    refine_intrinsics: bool = True,
+) -> InitialPairTrial | None:
+    """Initialize a model from two images as COLMAP's incremental mapper does.
 
     The mapper estimates the relative pose, triangulates the matches, and refines focal length and
     distortion together with the pose and the points. RANSAC may find a wrong pose, and two images
@@ -45,14 +49,16 @@ def first_images(
 
     Args:
         xy: float32 [n, 2] pixel coordinates of the inliers in each image.
-        camera: the camera of both images.
+        camera: the camera of both images, with a known focal length.
         limits: the mapper's limits of the initial pair.
+        refine_intrinsics: whether the mapper refines focal length and distortion.
 
     Returns:
-        None if the mapper does not begin with these images.
+        None if the mapper does not accept these images as an initial pair.
     """
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, extract_colors=False)
     options.init_image_id1, options.init_image_id2 = 1, 2
+    options.ba_refine_focal_length = options.ba_refine_extra_params = refine_intrinsics
     # Here each track has two views. In the database, it usually has more.
     options.triangulation.ignore_two_view_tracks = False
     for name, value in vars(limits).items():
@@ -71,7 +77,7 @@ def _begin(
     cache: pycolmap.DatabaseCache,
     options: pycolmap.IncrementalPipelineOptions,
     camera: pycolmap.Camera,
-) -> FirstImages | None:
+) -> InitialPairTrial | None:
     pipeline = pycolmap.IncrementalPipeline(options, cache, pycolmap.ReconstructionManager())
     mapper, model = pycolmap.IncrementalMapper(cache), pycolmap.Reconstruction()
     mapper.begin_reconstruction(model)
@@ -80,7 +86,7 @@ def _begin(
     if status == pycolmap.IncrementalPipelineStatus.SUCCESS:
         first, second = (model.images[number].cam_from_world() for number in (1, 2))
         pose = np.asarray((second * first.inverse()).matrix())
-        found = FirstImages(pose, _has_diverged(model.cameras[1], camera))
+        found = InitialPairTrial(pose, _has_diverged(model.cameras[1], camera))
     mapper.end_reconstruction(discard=True)
     return found
 
@@ -98,15 +104,13 @@ def _database_cache(
     xy: Sequence[NDArray[np.float32]], camera: pycolmap.Camera
 ) -> pycolmap.DatabaseCache:
     """What the mapper reads from a database with two images."""
-    # An assumed focal length counts as known: otherwise COLMAP 4.2 estimates it together with the
-    # pose, and its solver crashes on some pairs.
-    known = pycolmap.Camera({**camera.todict(), "camera_id": 1, "has_prior_focal_length": True})
+    own_camera = pycolmap.Camera({**camera.todict(), "camera_id": 1})
     matches = np.repeat(np.arange(len(xy[0]), dtype=np.uint32)[:, None], 2, axis=1)
     geometry = pycolmap.TwoViewGeometry(
         config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED, inlier_matches=matches
     )
     with pycolmap.Database.open(":memory:") as database:
-        database.write_camera(known, use_camera_id=True)
+        database.write_camera(own_camera, use_camera_id=True)
         for number, own in enumerate(xy, start=1):
             image = pycolmap.Image(name=str(number), camera_id=1, image_id=number)
             database.write_image(image, use_image_id=True)
