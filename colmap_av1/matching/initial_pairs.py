@@ -34,7 +34,7 @@ _Floats = NDArray[np.float64]
 # If no pair meets the mapper's limits for an initial pair, it halves the number of inliers, then
 # the angle.
 _MIN_INLIERS = INITIAL_MIN_INLIERS // 2
-# In the end, it has halved both twice, the angle perhaps from that of `SMALL_ANGLES`.
+# It halves both twice. These are the lowest limits if it begins with those of `SMALL_ANGLES`.
 _LEAST_INLIERS, _LEAST_ANGLE = INITIAL_MIN_INLIERS // 4, INITIAL_LEAST_ANGLE / 4
 # The mapper estimates poses anew. It certainly accepts a pair that exceeds its limits by this
 # factor.
@@ -128,7 +128,7 @@ def prepare_start(
         if len(known) > 1:
             # The mapper lowers its limits for the images that its first models leave.
             is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * _LEAST_ANGLE)
-            matched = _with_demoted(matched, np.flatnonzero(is_bad), _LEAST_INLIERS - 1)
+            matched = with_demoted(matched, np.flatnonzero(is_bad), _LEAST_INLIERS - 1)
             found = replace(found, count=_num_inliers(matched))
         limits = FORWARD_MOTION if matched.forward_motion else DEFAULT_LIMITS
         demote, is_tried = set[int](), False
@@ -153,31 +153,26 @@ def prepare_start(
             lowest_angle = max(lowest_angle, INITIAL_MIN_ANGLE / 2)
         is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * lowest_angle)
         demote |= set(np.flatnonzero(is_bad).tolist())
-    return PreparedStart(_with_demoted(matched, demote), limits, is_certain, is_tried)
+    return PreparedStart(with_demoted(matched, demote), limits, is_certain, is_tried)
 
 
-def demoted(geometry: TwoViewGeometry, most: int = _MIN_INLIERS - 1) -> TwoViewGeometry:
-    """Keep some of the inliers, evenly spread.
+def with_demoted(
+    matched: MatchedImages, which: Iterable[int], most: int = _MIN_INLIERS - 1
+) -> MatchedImages:
+    """Limit the inliers of pairs, and keep them evenly spread.
 
     Args:
-        geometry: geometry of a pair.
+        matched: the images.
+        which: indices of the pairs.
         most: largest number of inliers. With the default, there are too few until the mapper halves
             their number twice.
     """
-    count = len(geometry.inlier_matches)
-    if count <= most:
-        return geometry
-    chosen = evenly_spread(count, most, rounded=True)
-    return replace(geometry, inlier_matches=geometry.inlier_matches[chosen])
-
-
-def _with_demoted(
-    matched: MatchedImages, which: Iterable[int], most: int = _MIN_INLIERS - 1
-) -> MatchedImages:
-    """Limit the inliers of some pairs, given by their indices, see `demoted`."""
     geometries = list(matched.geometries)
     for k in which:
-        geometries[k] = demoted(geometries[k], most)
+        own = geometries[k].inlier_matches
+        if len(own) > most:
+            chosen = evenly_spread(len(own), most, rounded=True)
+            geometries[k] = replace(geometries[k], inlier_matches=own[chosen])
     return replace(matched, geometries=geometries)
 
 
@@ -222,9 +217,7 @@ class _Candidates:
         known: Sequence[Sequence[_Floats | None]],
     ) -> _Candidates:
         """Look at the poses of all pairs."""
-        count = np.array(
-            [len(geometry.inlier_matches) for geometry in matched.geometries], np.int64
-        )
+        count = _num_inliers(matched)
         angle, along, known_along = np.full((3, len(count)), np.nan)
         is_wrong = np.zeros(len(count), np.bool_)
         poses: list[_Floats | None] = [None] * len(count)

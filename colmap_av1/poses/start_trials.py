@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.matching.image_matches import MatchedImages
-from colmap_av1.matching.initial_pairs import PreparedStart, are_far, demoted
+from colmap_av1.matching.initial_pairs import PreparedStart, are_far, with_demoted
 from colmap_av1.matching.mapper_limits import RELAXED_LIMITS
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
@@ -123,10 +122,6 @@ def _without_failing_starts(
 
 def _demoted(matched: MatchedImages, which: NDArray[np.bool_]) -> MatchedImages | None:
     """The images with demoted pairs, bool [num_pairs]; None if they were demoted before."""
-    geometries = [
-        demoted(geometry) if demote else geometry
-        for geometry, demote in zip(matched.geometries, which.tolist(), strict=True)
-    ]
-    if all(new is old for new, old in zip(geometries, matched.geometries, strict=True)):
-        return None
-    return replace(matched, geometries=geometries)
+    changed = with_demoted(matched, np.flatnonzero(which))
+    both = zip(changed.geometries, matched.geometries, strict=True)
+    return None if all(new is old for new, old in both) else changed

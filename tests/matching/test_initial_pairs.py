@@ -57,8 +57,7 @@ def turned_views(
     """Two views, 20 degrees apart, of points within `spread` of the axis and `depth` of 1."""
     x = rng.uniform((-spread, -spread), (spread, spread), (count, 2))
     points = np.c_[x, np.ones(count)] * (1 + rng.uniform(-depth, depth, count))[:, None]
-    turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
-    moved = (points - [0, 0, 1]) @ turn.T + [0, 0, 1]
+    moved = points @ TURN.T + TURNED[:, 3]
     keypoints = []
     for frame, seen in enumerate((points, moved)):
         xy = CAMERA.img_from_cam(seen) + rng.normal(0, 0.3, (count, 2))
@@ -182,9 +181,8 @@ def test_wrong_pair_below_the_angle_of_a_good_pair_is_kept() -> None:
     keypoints = [k for views in (wide, narrow) for k in views[0]]
     geometries = [verified(*views) for views in (wide, narrow)]
     pairs = np.array([[0, 1], [2, 3]], dtype=np.int32)
-    turn = Rotation.from_euler("y", 20, degrees=True).as_matrix()
-    of_wide = [np.eye(3, 4), np.column_stack([turn, [0, 0, 1] - turn[:, 2]])]
-    of_narrow = [np.eye(3, 4), np.hstack([turn, [[0], [0], [0]]])]
+    of_wide = [np.eye(3, 4), TURNED]
+    of_narrow = [np.eye(3, 4), np.hstack([TURN, [[0], [0], [0]]])]
     poses = [*of_wide, *of_narrow]
     for chosen, is_kept in (([0, 1], True), ([1], False)):
         matched = MatchedImages(
