@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import sqlite3
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -226,6 +229,21 @@ def test_interrupt_leaves_nothing(database: Path, images: Path, tmp_path: Path) 
     with pytest.raises(KeyboardInterrupt):
         map_database(database, images, tmp_path / "model", progress=interrupt)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_command_leaves_no_log_files_of_colmap(
+    database: Path, images: Path, tmp_path: Path
+) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    words = ["map", "--database_path", database, "--image_path", images]
+    subprocess.run(
+        [sys.executable, "-m", "colmap_av1", *words, "--output_path", tmp_path / "model"],
+        env={**os.environ, "TMPDIR": str(temporary)},
+        check=True,
+        capture_output=True,
+    )
+    assert list(temporary.iterdir()) == []
 
 
 def test_command_reports_the_model_and_refuses_an_existing_folder(

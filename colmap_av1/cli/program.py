@@ -109,7 +109,9 @@ def _import_libraries(*, with_pycolmap: bool) -> None:
         if given is None:
             del os.environ[BLAS_THREADS]  # child processes are not limited
         if with_pycolmap:
-            import pycolmap  # noqa: F401
+            import pycolmap
+
+            pycolmap.logging.logtostderr = True
 
 
 def _parse(words: Sequence[str]) -> argparse.Namespace:

@@ -25,6 +25,7 @@ def run_child(settings: dict[str, Any]) -> None:
     import numpy as np  # noqa: F401, PLC0415 - before pycolmap
     import pycolmap  # noqa: PLC0415
 
+    pycolmap.logging.logtostderr = True  # instead of to files in the temporary folder
     pycolmap.set_random_seed(settings["seed"])
     try:
         if settings["task"] == "adjustment":

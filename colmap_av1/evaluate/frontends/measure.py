@@ -106,6 +106,8 @@ def _call(
         # C++ libraries write to the file descriptors, not to sys.stdout and sys.stderr.
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
+    # pycolmap logs to that file alone.
+    os.environ["GLOG_logtostderr"] = "1"  # noqa: SIM112
     let_through()
     outcome: Measured[Any] | ColmapAv1Error | str
     start, cpu = time.perf_counter(), cpu_seconds()
