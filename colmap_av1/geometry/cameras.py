@@ -31,11 +31,6 @@ _SHORTEST, _LONGEST = 0.3, 5.0
 _LONG = 1.2
 # Larger image sides in pixels are damaged data.
 _LONGEST_SIDE = 1 << 20
-# One distortion parameter suffices if the camera that has only one moves positions by at most this
-# RMS distance in pixels, about the accuracy of keypoints.
-_ONE_PARAMETER_ERROR = 0.5
-# Positions per image side at which distortion is compared.
-_GRID = 32
 # Encoders round the display size of scaled pictures, by a few tenths of a percent.
 _SQUARE_TOLERANCE = 5e-3
 
@@ -130,36 +125,6 @@ def with_initial_intrinsics(camera: pycolmap.Camera) -> pycolmap.Camera:
     initial.params = params.tolist()
     initial.has_prior_focal_length = False
     return initial
-
-
-def with_one_distortion_parameter(camera: pycolmap.Camera) -> pycolmap.Camera:
-    """The SIMPLE_RADIAL camera closest to a RADIAL one.
-
-    The first images of a model rarely determine a second distortion parameter. COLMAP's mapper
-    refines it all the same. It may then diverge, and no further image registers.
-
-    Returns:
-        The given camera if its distortion needs both parameters.
-    """
-    columns, rows = (
-        np.linspace(0, side, _GRID) - centre
-        for side, centre in zip((camera.width, camera.height), camera.params[1:3], strict=True)
-    )
-    xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    x = np.asarray(camera.cam_from_img(xy + camera.params[1:3]))
-    radius, distorted = np.hypot(*x.T), np.hypot(*xy.T)
-    if not np.isfinite(radius).all():
-        return camera
-    # A radius r in normalised coordinates is at f r + f k r^3 pixels.
-    terms = np.column_stack([radius, radius**3])
-    (focal_length, cubic), *_ = np.linalg.lstsq(terms, distorted, rcond=None)
-    errors = terms @ (focal_length, cubic) - distorted
-    if np.sqrt(np.mean(errors**2)) > _ONE_PARAMETER_ERROR:
-        return camera
-    simple = pycolmap.Camera(camera.todict())
-    simple.model = pycolmap.CameraModelId.SIMPLE_RADIAL
-    simple.params = [focal_length, *camera.params[1:3], cubic / focal_length]
-    return simple
 
 
 def is_undistorted(camera: pycolmap.Camera) -> bool:

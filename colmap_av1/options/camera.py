@@ -39,8 +39,7 @@ class CameraOptions(Options):
     camera_model: str | None = option(
         None,
         "one of COLMAP's camera models; None: RADIAL if the focal length can be estimated from the "
-        "tracks, else SIMPLE_RADIAL, and also if match finds that one distortion parameter "
-        "suffices; OPENCV, which has two focal lengths, if pixels are not square",
+        "tracks, else SIMPLE_RADIAL; OPENCV, which has two focal lengths, if pixels are not square",
         common=True,
     )
     camera_params: str | None = option(

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from colmap_av1.database.listed import listed_cameras
 from colmap_av1.database.reading import read_images
 from colmap_av1.errors import ModelError
-from colmap_av1.geometry.cameras import with_one_distortion_parameter
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, reprojection_errors
 from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.images.image_set import ImageSet
@@ -389,8 +388,7 @@ def _cameras(run: Run, image_set: ImageSet, models: Sequence[_Model]) -> list[py
     Cameras of an existing database stay unchanged. If the focal length of a video changes, each of
     its images has its own adjusted camera. Otherwise the images of a video have the adjusted camera
     of its largest model, if the focal length was estimated from tracks or the model determines it;
-    if not, the assumed one. A second distortion parameter that is not necessary is omitted, unless
-    the camera model is given.
+    if not, the assumed one.
     """
     if run.cameras is not None:
         return run.cameras.of_images
@@ -434,11 +432,7 @@ def _cameras(run: Run, image_set: ImageSet, models: Sequence[_Model]) -> list[py
         found = next(iter(adjusted.values()), camera)
         is_known = camera.has_prior_focal_length or determined.get(id(found), False)
         cameras.append(found if is_known else camera)
-    if run.options.match.camera.camera_model is not None:
-        return cameras
-    radial = {id(camera): camera for camera in cameras if camera.model_name == "RADIAL"}
-    simple = {key: with_one_distortion_parameter(camera) for key, camera in radial.items()}
-    return [simple.get(id(camera), camera) for camera in cameras]
+    return cameras
 
 
 def _focal_length(run: Run, camera: pycolmap.Camera) -> float | None:

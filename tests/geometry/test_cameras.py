@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pycolmap
 import pytest
 
@@ -11,7 +10,6 @@ from colmap_av1.geometry.cameras import (
     has_long_focal_length,
     make_camera,
     with_initial_intrinsics,
-    with_one_distortion_parameter,
 )
 from colmap_av1.options import CameraOptions
 
@@ -48,23 +46,3 @@ def test_initial_intrinsics_are_those_of_a_new_camera(model: str) -> None:
     refined.params = params.tolist()
     assert with_initial_intrinsics(refined).params.tolist() == pytest.approx(new.params.tolist())
     assert refined.mean_focal_length() == 900.0
-
-
-def test_second_distortion_parameter_of_a_phone_is_omitted() -> None:
-    lens = pycolmap.Camera(
-        camera_id=3, model="RADIAL", width=450, height=800, params=[711, 225, 400, 0.084, -0.143]
-    )
-    lens.has_prior_focal_length = True
-    simple = with_one_distortion_parameter(lens)
-    assert (simple.model_name, simple.camera_id) == ("SIMPLE_RADIAL", 3)
-    assert simple.has_prior_focal_length
-    xy = np.random.default_rng(0).uniform((0, 0), (450, 800), (1000, 2))
-    moved = simple.img_from_cam(np.c_[lens.cam_from_img(xy), np.ones(1000)]) - xy
-    assert np.sqrt((moved**2).sum(axis=1).mean()) < 0.5
-
-
-def test_wide_lens_keeps_two_distortion_parameters() -> None:
-    lens = pycolmap.Camera(
-        camera_id=3, model="RADIAL", width=450, height=800, params=[317, 225, 400, 0.011, -0.015]
-    )
-    assert with_one_distortion_parameter(lens) is lens

@@ -106,7 +106,7 @@ def test_camera_of_the_database_is_the_estimated_one(joint: MatchReport, truth: 
     (camera,) = read_cameras(joint.database).values()
     assert camera.has_prior_focal_length
     assert camera.focal_length_x == pytest.approx(joint.focal_length)
-    assert camera.model_name == "SIMPLE_RADIAL"  # the lens has no distortion
+    assert camera.model_name == "RADIAL"
 
 
 def test_no_track_has_two_keypoints_in_an_image(joint: MatchReport) -> None:
