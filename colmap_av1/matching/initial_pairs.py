@@ -110,10 +110,12 @@ def prepare_start(
 
     If the limits are not the default ones, the mapper without options tries hundreds of pairs with
     few inliers. RANSAC may give any of them a wrong pose with a large angle. These pairs are
-    demoted, too, except neighbours, which connect the images.
+    demoted, too, except neighbours, which connect the images. For small angles, demoted pairs keep
+    fewer inliers than the mapper ever accepts. For forward motion they do not, because it might
+    find no pair at all.
 
     If poses are known of several models, the mapper begins several times, and pairs with a wrong
-    pose keep fewer inliers than it ever accepts.
+    pose keep fewer inliers than it ever accepts, too.
 
     Args:
         matched: the images. The pose of the homography is tested only for pairs with an essential
@@ -131,7 +133,7 @@ def prepare_start(
             matched = with_demoted(matched, np.flatnonzero(is_bad), _LEAST_INLIERS - 1)
             found = replace(found, count=_num_inliers(matched))
         limits = FORWARD_MOTION if matched.forward_motion else DEFAULT_LIMITS
-        demote, is_tried = set[int](), False
+        demote, is_tried, most = set[int](), False, _MIN_INLIERS - 1
         if known:
             search = _Search(matched, cameras, found, Growth(matched, cameras, known))
             certain_limits, demote = search.first_certain()
@@ -142,6 +144,7 @@ def prepare_start(
                 demote |= set(np.flatnonzero(has_few).tolist())
             if limits == SMALL_ANGLES:
                 demote = search.bad_pairs_with_relaxed_limits(demote)
+                most = _LEAST_INLIERS - 1
             is_tried = is_certain and not search.has_zoom
         else:
             is_certain = bool(found.certain(limits).any())
@@ -153,7 +156,7 @@ def prepare_start(
             lowest_angle = max(lowest_angle, INITIAL_MIN_ANGLE / 2)
         is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * lowest_angle)
         demote |= set(np.flatnonzero(is_bad).tolist())
-    return PreparedStart(with_demoted(matched, demote), limits, is_certain, is_tried)
+    return PreparedStart(with_demoted(matched, demote, most), limits, is_certain, is_tried)
 
 
 def with_demoted(
@@ -342,7 +345,7 @@ class _Search:
         bad = set(demoted)
         while True:
             count = found.count.copy()
-            count[list(bad)] = np.minimum(count[list(bad)], _MIN_INLIERS - 1)
+            count[list(bad)] = np.minimum(count[list(bad)], _LEAST_INLIERS - 1)
             num_before = len(bad)
             order, rank, place = self._order(count)
             first = None  # the first certain pair, as a place in the order
