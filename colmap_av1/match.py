@@ -270,13 +270,13 @@ def match(
         )
         cameras = _listed_cameras(database, listed, images) if listed else None
         found = _match_images(images, cameras, scratch, options, context)
+        is_joint, is_assumed = isinstance(found, JointMatches), _has_assumed_focal_length(found)
         # The poses of pairs are wrong if a focal length is assumed.
-        has_focal_lengths = all(camera.has_prior_focal_length for camera in found.cameras)
-        known = found.poses if isinstance(found, JointMatches) and has_focal_lengths else ()
+        known = found.poses if isinstance(found, JointMatches) and not is_assumed else ()
         start = prepare_start(found.matched, found.cameras, clock, known)
         # The estimate does not change the cameras of an existing database.
-        is_undetermined = cameras is None and _has_assumed_focal_length(found)
-        is_known_ahead = start.limits == FORWARD_MOTION and has_focal_lengths
+        is_undetermined = cameras is None and is_joint and is_assumed
+        is_known_ahead = start.limits == FORWARD_MOTION and not is_assumed
         fixed_intrinsics = is_known_ahead or is_undetermined
         written = start.matched
         names = images.image_set.images.names
@@ -515,12 +515,16 @@ def _match_images(
 
 
 def _has_assumed_focal_length(found: ImageMatches) -> bool:
-    """Whether a joint estimate registers images whose focal length it does not determine."""
-    return isinstance(found, JointMatches) and any(
+    """Whether the focal length of an image is assumed.
+
+    With a joint estimate, images that it does not register do not count.
+    """
+    models = found.poses if isinstance(found, JointMatches) else [found.cameras]
+    return any(
         not camera.has_prior_focal_length
-        for poses in found.poses
-        for camera, pose in zip(found.cameras, poses, strict=True)
-        if pose is not None
+        for images in models
+        for camera, image in zip(found.cameras, images, strict=True)
+        if image is not None
     )
 
 

@@ -173,6 +173,24 @@ def test_photo_of_another_scene_is_reported(
     assert read_images(tmp_path / "a.db")[0].name == "frame_000000.png"
 
 
+def test_photo_of_another_scene_does_not_change_the_options_of_the_mapper(
+    halves: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """They depend on the poses of the other images."""
+    options = replace(QUICK, images=ImageOptions(every=1))
+    album = tmp_path / "album"
+    album.mkdir()
+    cv2.imwrite(str(album / "cat.png"), make_frames(1)[0])
+    alone, together = (
+        match(f"{path}.db", halves[0], photos=photos, image_path=path, options=options)
+        for path, photos in ((tmp_path / "alone", None), (tmp_path / "together", album))
+    )
+    assert together.estimate is not None
+    assert together.estimate.num_registered == (16,)
+    assert alone.small_angles
+    assert together.small_angles
+
+
 def test_same_video_twice_is_an_error(halves: tuple[Path, Path], tmp_path: Path) -> None:
     copy = tmp_path / "copy.mp4"
     shutil.copyfile(halves[0], copy)
