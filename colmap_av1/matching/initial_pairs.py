@@ -36,6 +36,8 @@ _Floats = NDArray[np.float64]
 _MIN_INLIERS = INITIAL_MIN_INLIERS // 2
 # It halves both twice. These are the lowest limits if it begins with those of `SMALL_ANGLES`.
 _LEAST_INLIERS, _LEAST_ANGLE = INITIAL_MIN_INLIERS // 4, INITIAL_LEAST_ANGLE / 4
+# Number of inliers that a demoted pair keeps: too few until the mapper halves their number twice.
+_FEW_INLIERS = _MIN_INLIERS - 1
 # The mapper estimates poses anew. It certainly accepts a pair that exceeds its limits by this
 # factor.
 _MARGIN = 1.1
@@ -47,9 +49,9 @@ _ALONG_MARGIN = 0.02
 # this many pairs.
 _LARGE = 0.8
 _NUM_GROWN = 16
-# With several threads, the mapper tries the pairs of up to 16 images at a time. When it accepts the
-# n-th pair of one image, it may have tried 2 n + 4 pairs of another.
-_NUM_THREADS, _NUM_AHEAD = 16, 4
+# With several threads, the mapper tries the pairs of up to 16 images at a time. Before it begins
+# with the n-th pair of one image, counted from 0, it may find one of the first 2 n + 2 of another.
+_NUM_THREADS = 16
 # Neighbours are at most this many images apart. They connect the images, and are only demoted if
 # their pose is wrong, or if the mapper begins badly with them.
 NEIGHBOURS = 2
@@ -110,9 +112,9 @@ def prepare_start(
 
     If the limits are not the default ones, the mapper without options tries hundreds of pairs with
     few inliers. RANSAC may give any of them a wrong pose with a large angle. These pairs are
-    demoted, too, except neighbours, which connect the images. For small angles, demoted pairs keep
-    fewer inliers than the mapper ever accepts. For forward motion they do not, because it might
-    find no pair at all.
+    demoted, too, except neighbours, which connect the images. If all images are in one model, they
+    keep fewer inliers than the mapper ever accepts. Otherwise the images of fast turns might not
+    register, and with forward motion the mapper might find no pair at all.
 
     If poses are known of several models, the mapper begins several times, and pairs with a wrong
     pose keep fewer inliers than it ever accepts, too.
@@ -133,19 +135,12 @@ def prepare_start(
             matched = with_demoted(matched, np.flatnonzero(is_bad), _LEAST_INLIERS - 1)
             found = replace(found, count=_num_inliers(matched))
         limits = FORWARD_MOTION if matched.forward_motion else DEFAULT_LIMITS
-        demote, is_tried, most = set[int](), False, _MIN_INLIERS - 1
+        search, demote = None, set[int]()
         if known:
             search = _Search(matched, cameras, found, Growth(matched, cameras, known))
             certain_limits, demote = search.first_certain()
             is_certain = certain_limits is not None
             limits = certain_limits or limits
-            if limits != DEFAULT_LIMITS:
-                has_few = found.is_far & (found.count < _MARGIN * INITIAL_MIN_INLIERS)
-                demote |= set(np.flatnonzero(has_few).tolist())
-            if limits == SMALL_ANGLES:
-                demote = search.bad_pairs_with_relaxed_limits(demote)
-                most = _LEAST_INLIERS - 1
-            is_tried = is_certain and not search.has_zoom
         else:
             is_certain = bool(found.certain(limits).any())
         lowest_angle = limits.init_min_tri_angle
@@ -155,20 +150,28 @@ def prepare_start(
             # Wrong pairs with smaller angles are demoted if the mapper would find them first.
             lowest_angle = max(lowest_angle, INITIAL_MIN_ANGLE / 2)
         is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * lowest_angle)
+        if known and is_certain and limits != DEFAULT_LIMITS:
+            is_bad |= found.is_far & (found.count < _MARGIN * INITIAL_MIN_INLIERS)
         demote |= set(np.flatnonzero(is_bad).tolist())
+        most, is_tried = _FEW_INLIERS, False
+        if search is not None and is_certain:
+            if limits == SMALL_ANGLES and len(known) == 1:
+                most = _LEAST_INLIERS - 1
+            # The demoted pairs change the order of the others.
+            demote = search.bad_pairs_of_all_limits(limits, demote, most)
+            is_tried = not search.has_zoom
     return PreparedStart(with_demoted(matched, demote, most), limits, is_certain, is_tried)
 
 
 def with_demoted(
-    matched: MatchedImages, which: Iterable[int], most: int = _MIN_INLIERS - 1
+    matched: MatchedImages, which: Iterable[int], most: int = _FEW_INLIERS
 ) -> MatchedImages:
     """Limit the inliers of pairs, and keep them evenly spread.
 
     Args:
         matched: the images.
         which: indices of the pairs.
-        most: largest number of inliers. With the default, there are too few until the mapper halves
-            their number twice.
+        most: largest number of inliers.
     """
     geometries = list(matched.geometries)
     for k in which:
@@ -247,7 +250,8 @@ class _Candidates:
 
     def certain(self, limits: InitialLimits) -> NDArray[np.bool_]:
         """Whether the mapper certainly accepts each pair, bool [num_pairs]."""
-        is_certain = self.is_sound & (self.count >= _MARGIN * limits.init_min_num_inliers)
+        is_certain = self.is_sound & self.possible(limits)
+        is_certain &= self.count >= _MARGIN * limits.init_min_num_inliers
         is_certain &= self.angle >= _MARGIN * limits.init_min_tri_angle
         if limits.init_max_forward_motion < 1.0:
             along = np.fmax(self.along, self.known_along)
@@ -304,26 +308,31 @@ class _Search:
                     return limits, bad
         return None, set()
 
-    def bad_pairs_with_relaxed_limits(self, demoted: set[int]) -> set[int]:
-        """Pairs that the mapper without options may find before a good one.
+    def bad_pairs_of_all_limits(
+        self, limits: InitialLimits, demoted: set[int], most: int
+    ) -> set[int]:
+        """Pairs that the mapper may find before a good one, with options or without.
 
-        It lowers its default limits until it finds a pair.
+        Without options, it lowers its default limits until it finds a pair.
 
         Args:
+            limits: the limits of the options.
             demoted: indices of pairs that are demoted.
+            most: number of inliers that demoted pairs keep.
 
         Returns:
             Indices of these pairs, including the demoted ones.
         """
-        bad = demoted
-        for limits in (DEFAULT_LIMITS, *RELAXED_LIMITS):
-            bad, has_good = self.bad_pairs(limits, bad)
-            if has_good:
-                break
+        bad, _ = self.bad_pairs(limits, demoted, most)
+        if limits == SMALL_ANGLES:
+            for own in (DEFAULT_LIMITS, *RELAXED_LIMITS):
+                bad, has_good = self.bad_pairs(own, bad, most)
+                if has_good:
+                    break
         return bad
 
     def bad_pairs(
-        self, limits: InitialLimits, demoted: Collection[int] = ()
+        self, limits: InitialLimits, demoted: Collection[int] = (), most: int = _FEW_INLIERS
     ) -> tuple[set[int], bool]:
         """Pairs that the mapper may find before it finds a good one.
 
@@ -334,6 +343,7 @@ class _Search:
         Args:
             limits: the limits of the initial pair.
             demoted: indices of pairs that are demoted.
+            most: number of inliers that demoted pairs keep.
 
         Returns:
             Indices of bad pairs, including the demoted ones; neighbours only if their pose is wrong
@@ -345,25 +355,27 @@ class _Search:
         bad = set(demoted)
         while True:
             count = found.count.copy()
-            count[list(bad)] = np.minimum(count[list(bad)], _LEAST_INLIERS - 1)
+            count[list(bad)] = np.minimum(count[list(bad)], most)
             num_before = len(bad)
             order, rank, place = self._order(count)
-            first = None  # the first certain pair, as a place in the order
+            first = last = None  # places in the order of the first and the latest certain pair
             for i, k in enumerate(order.tolist()):
                 if not possible[k] or count[k] < limits.init_min_num_inliers:
                     continue
+                if last is not None and rank[i] == rank[last]:
+                    continue  # the mapper tries no further pair of this image
                 if first is not None:
                     if rank[i] >= rank[first] + _NUM_THREADS:
                         break
-                    if rank[i] == rank[first] or place[i] > 2 * place[first] + _NUM_AHEAD:
+                    if place[i] > 2 * place[first] + 1:
                         continue
                 if is_sound[k]:
                     has_begun = self._begins(k, limits)
                     if has_begun is None:
                         continue  # the mapper rejects the pair
                     if has_begun and self._is_large(k):
-                        if certain[k] and first is None:
-                            first = i
+                        if certain[k]:
+                            first, last = i if first is None else first, i
                         continue
                     if not has_begun:
                         bad.add(k)
