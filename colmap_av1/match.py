@@ -321,7 +321,7 @@ def match(
     # Few matches do not mean a gap if existing matches of the database may connect the images, or
     # with a joint estimate, which omits matches that only repeat tracks of other pairs.
     if options.on_existing != "append" and not isinstance(found, JointMatches):
-        doubts.append(matching_warning(written, images.image_set))
+        doubts.append(matching_warning(found.matched, images.image_set))
     notes += tuple(doubt for doubt in doubts if doubt is not None)
     return MatchReport(
         database=database,

@@ -168,7 +168,7 @@ def match_jointly(
         paired = _paired(run, image_set, agreeing, others, density)
     cameras = _cameras(run, image_set, models)
     matched = verify_images(paired, cameras, run.options.match.verify, run.context)
-    warnings = _warnings(far, models, left, model_of, image_set)
+    warnings = _warnings(far, models, left, others, image_set)
     if first.adjusted.seams_warning is not None:
         warnings.append(first.adjusted.seams_warning)
     matches = posed.matches.result
@@ -401,18 +401,23 @@ def _cameras(run: Run, image_set: ImageSet, models: Sequence[_Model]) -> list[py
     of_sequence = {sequence: matched[name] for sequence, name in named if name in matched}
     initial = [of_sequence[sequence] for sequence, _ in named]
     # Images share a camera if it is the same object, see `ImageMatches`. The adjusted cameras of
-    # the images that share each, in the first model that has any of them.
+    # the images that share each: in the first model that has any of them, or in all if the focal
+    # length changes.
     sharing: dict[int, dict[int, pycolmap.Camera]] = {}
     determined = dict[int, bool]()
     for model in models:
         own = defaultdict[int, dict[int, pycolmap.Camera]](dict)
         in_model = {image.name: image.camera_id for image in model.placed.images}
         for i, (_, name) in enumerate(named):
-            if name in in_model and id(initial[i]) not in sharing:
+            if name in in_model:
                 own[id(initial[i])][i] = model.known.cameras[in_model[name]]
-        sharing |= own
+        new = {key: adjusted for key, adjusted in own.items() if key not in sharing}
+        for key in own.keys() & sharing.keys():
+            if _have_several_cameras(sharing[key]) or _have_several_cameras(own[key]):
+                sharing[key] |= own[key]
+        sharing |= new
         assumed = any(
-            not initial[i].has_prior_focal_length for images in own.values() for i in images
+            not initial[i].has_prior_focal_length for images in new.values() for i in images
         )
         errors = {}
         if assumed and refines_intrinsics(run.options):
@@ -424,7 +429,7 @@ def _cameras(run: Run, image_set: ImageSet, models: Sequence[_Model]) -> list[py
     cameras = []
     for i, camera in enumerate(initial):
         adjusted = sharing.get(id(camera), {})
-        if len(set(map(id, adjusted.values()))) > 1:
+        if _have_several_cameras(adjusted):
             places = np.array(list(adjusted))
             nearest = adjusted[int(places[np.argmin(np.abs(places - i))])]
             cameras.append(nearest if i in adjusted else copy.copy(nearest))
@@ -433,6 +438,10 @@ def _cameras(run: Run, image_set: ImageSet, models: Sequence[_Model]) -> list[py
         is_known = camera.has_prior_focal_length or determined.get(id(found), False)
         cameras.append(found if is_known else camera)
     return cameras
+
+
+def _have_several_cameras(camera_of_image: dict[int, pycolmap.Camera]) -> bool:
+    return len(set(map(id, camera_of_image.values()))) > 1
 
 
 def _focal_length(run: Run, camera: pycolmap.Camera) -> float | None:
@@ -445,7 +454,7 @@ def _warnings(
     far: LongRangeResult | None,
     models: Sequence[_Model],
     left: Sequence[str],
-    model_of: NDArray[np.int64],
+    others: Tracks,
     image_set: ImageSet,
 ) -> list[str]:
     """Warnings about the estimate.
@@ -454,7 +463,7 @@ def _warnings(
         far: result of the long-range check of the first model; None without one.
         models: the models.
         left: names of the images that are not registered.
-        model_of: see `models_of_images`.
+        others: the tracks by which images are matched that are not registered.
         image_set: all images.
     """
     warnings = []
@@ -469,14 +478,14 @@ def _warnings(
             f"hardly any points connect {len(models)} parts of the images, which are matched "
             f"separately: {parts}; a mapper makes a model of each, not always the largest first"
         )
-    num_images = len(model_of)
-    belongs = dict(zip(image_set.images.names, (model_of >= 0).tolist(), strict=True))
-    moved = [name for name in left if belongs[name]]
-    alone = [name for name in left if not belongs[name]]
-    if moved:
+    num_images = len(image_set.sequence)
+    is_matched = np.isin([image_set.images.frame_of[name] for name in left], others.frame)
+    matched = [name for name, own in zip(left, is_matched, strict=True) if own]
+    alone = [name for name, own in zip(left, is_matched, strict=True) if not own]
+    if matched:
         warnings.append(
-            f"{len(moved)} of {num_images} images are not registered in the joint estimate and are "
-            f"matched by motion alone: {some_names(moved)}"
+            f"{len(matched)} of {num_images} images are not registered in the joint estimate and "
+            f"are matched without known poses: {some_names(matched)}"
         )
     if alone:
         warnings.append(

@@ -100,6 +100,6 @@ def models_of_images(
             model_of[left] = np.where(is_within, around[gap], -1)
         else:
             touching = np.isin(tracks.track, tracks.track[np.isin(image, own)])
-            shared = model_of[image[touching]]
+            shared = np.unique([tracks.track[touching], model_of[image[touching]]], axis=1)[1]
             model_of[own] = np.bincount(shared[shared >= 0], minlength=1).argmax()
     return model_of
