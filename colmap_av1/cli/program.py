@@ -36,7 +36,7 @@ examples:
       matches for COLMAP's mapper; also writes the images
   {PROGRAM} reconstruct --video phone.mp4 --output my_scene
       a dense model with undistorted images, for splat trainers
-  {PROGRAM} densify --model my_model/0 --video phone.mp4 --output my_dense_model
+  {PROGRAM} densify --model my_model/0 --video phone.mp4 --image_path my_frames --output my_dense
       dense points for an existing model of the video
 """
 _INTERRUPTED = 130

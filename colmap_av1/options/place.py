@@ -96,8 +96,8 @@ def parse_distance(text: str) -> KnownDistance:
     except ValueError:
         raise OptionError(
             f"scale '{text}' is invalid: give METRES=A,B, such as "
-            "2.5=frame_000010.png,frame_000200.png, or mark A and B in two images each, such as "
-            "frame_000010.png:310:402+frame_000200.png:290:398"
+            "2.5=frame_000010.jpg,frame_000200.jpg, or mark A and B in two images each, such as "
+            "frame_000010.jpg:310:402+frame_000200.jpg:290:398"
         ) from None
     if not (math.isfinite(metres) and metres > 0):
         raise OptionError(f"scale '{text}' is not above 0 metres: give a positive distance")
