@@ -18,9 +18,9 @@ from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.gaps import Gap, few_matches_warning
 from colmap_av1.matching.mapper_limits import (
     FORWARD_MOTION,
-    INITIAL_LEAST_ANGLE,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
+    INITIAL_SMALL_ANGLE,
     MIN_INLIERS,
     SMALL_ANGLES,
 )
@@ -311,7 +311,7 @@ def motion_findings(
         yield Finding("warning" if depth.is_observable else "error", depth.warning)
     if parallax.angle is None:
         yield Finding("note", "parallax is unknown: the widest pairs have no stored model")
-    elif parallax.angle < INITIAL_LEAST_ANGLE:
+    elif parallax.angle < INITIAL_SMALL_ANGLE:
         yield Finding(
             "warning",
             f"parallax of {parallax.angle:.1f} degrees: the incremental mapper may find no initial "

@@ -30,7 +30,7 @@ class Growth:
 
     The prediction assumes that each registered image gets its right pose and that no match is an
     outlier. A track has a point once a registered image observes it at a sufficient angle to the
-    first one that does. The larger angle of the first points is ignored.
+    first one that does. The mapper requires a larger angle of the first points; this is ignored.
 
     Args:
         matched: the images.

@@ -17,9 +17,11 @@ from colmap_av1.matching.initial_pair_trial import try_initial_pair
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
-    INITIAL_LEAST_ANGLE,
+    INITIAL_FORWARD_TOLERANCE,
+    INITIAL_MARGIN,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
+    INITIAL_SMALL_ANGLE,
     RELAXED_LIMITS,
     SMALL_ANGLES,
     InitialLimits,
@@ -35,16 +37,11 @@ _Floats = NDArray[np.float64]
 # the angle.
 _MIN_INLIERS = INITIAL_MIN_INLIERS // 2
 # It halves both twice. These are the lowest limits if it begins with those of `SMALL_ANGLES`.
-_LEAST_INLIERS, _LEAST_ANGLE = INITIAL_MIN_INLIERS // 4, INITIAL_LEAST_ANGLE / 4
+_LEAST_INLIERS, _LEAST_ANGLE = INITIAL_MIN_INLIERS // 4, INITIAL_SMALL_ANGLE / 4
 # Number of inliers that a demoted pair keeps: too few until the mapper halves their number twice.
 _FEW_INLIERS = _MIN_INLIERS - 1
-# The mapper estimates poses anew. It certainly accepts a pair that exceeds its limits by this
-# factor.
-_MARGIN = 1.1
-# It may accept a pair with this share of the angle that it requires.
+# The mapper may accept a pair with this share of the angle that it requires.
 _WIDE_SHARE = 0.75
-# Tolerance of the translation along the optical axis, which the mapper estimates anew.
-_ALONG_MARGIN = 0.02
 # A model is large if it has this share of the images of the largest model that grows from any of
 # this many pairs.
 _LARGE = 0.8
@@ -102,7 +99,8 @@ def prepare_start(
     begins with the pair fails after a few images, and the mapper still writes it first. The same
     happens if the mapper finds another pose, or if the intrinsics diverge, see `try_initial_pair`.
     A demoted pair keeps enough inliers to connect its images; tracks continue through the pairs
-    between. A bad pair is not demoted if the mapper finds a good pair first.
+    between. Pairs with a wrong pose are demoted if its angle is large enough for the mapper, others
+    only if the mapper might find them before a good pair.
 
     Known poses also show with which limits the mapper begins with a pair that grows to the largest
     model, or nearly, see `Growth`. These limits are chosen, the default ones if possible, and those
@@ -151,7 +149,7 @@ def prepare_start(
             lowest_angle = max(lowest_angle, INITIAL_MIN_ANGLE / 2)
         is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * lowest_angle)
         if known and is_certain and limits != DEFAULT_LIMITS:
-            is_bad |= found.is_far & (found.count < _MARGIN * INITIAL_MIN_INLIERS)
+            is_bad |= found.is_far & (found.count < INITIAL_MARGIN * INITIAL_MIN_INLIERS)
         demote |= set(np.flatnonzero(is_bad).tolist())
         most, is_tried = _FEW_INLIERS, False
         if search is not None and is_certain:
@@ -159,7 +157,7 @@ def prepare_start(
                 most = _LEAST_INLIERS - 1
             # The demoted pairs change the order of the others.
             demote = search.bad_pairs_of_all_limits(limits, demote, most)
-            is_tried = not search.has_zoom
+            is_tried = not search.has_untried_pair
     return PreparedStart(with_demoted(matched, demote, most), limits, is_certain, is_tried)
 
 
@@ -251,18 +249,20 @@ class _Candidates:
     def certain(self, limits: InitialLimits) -> NDArray[np.bool_]:
         """Whether the mapper certainly accepts each pair, bool [num_pairs]."""
         is_certain = self.is_sound & self.possible(limits)
-        is_certain &= self.count >= _MARGIN * limits.init_min_num_inliers
-        is_certain &= self.angle >= _MARGIN * limits.init_min_tri_angle
+        is_certain &= self.count >= INITIAL_MARGIN * limits.init_min_num_inliers
+        is_certain &= self.angle >= INITIAL_MARGIN * limits.init_min_tri_angle
         if limits.init_max_forward_motion < 1.0:
             along = np.fmax(self.along, self.known_along)
-            is_certain &= along < limits.init_max_forward_motion - _ALONG_MARGIN
+            is_certain &= along < limits.init_max_forward_motion - INITIAL_FORWARD_TOLERANCE
         return is_certain
 
     def possible(self, limits: InitialLimits) -> NDArray[np.bool_]:
         """Whether the mapper may accept each pair, bool [num_pairs]."""
         is_possible = self.count >= limits.init_min_num_inliers
         is_possible &= self.angle >= _WIDE_SHARE * limits.init_min_tri_angle
-        return is_possible & (self.along < limits.init_max_forward_motion + _ALONG_MARGIN)
+        return is_possible & (
+            self.along < limits.init_max_forward_motion + INITIAL_FORWARD_TOLERANCE
+        )
 
 
 class _Search:
@@ -275,7 +275,7 @@ class _Search:
         growth: the growth of models.
 
     Attributes:
-        has_zoom: whether a pair has two cameras and was not tried.
+        has_untried_pair: whether a pair was not tried because its images have different cameras.
     """
 
     def __init__(
@@ -287,7 +287,7 @@ class _Search:
     ) -> None:
         self._matched, self._cameras, self._found = matched, cameras, found
         self._growth = growth
-        self.has_zoom = False
+        self.has_untried_pair = False
         self._known_large = dict[int, bool]()
         self._known_begun = dict[tuple[int, InitialLimits], bool | None]()
         some = np.flatnonzero(found.certain(FORWARD_MOTION))
@@ -425,7 +425,7 @@ class _Search:
         # With a zoom, each image has its own camera. The mapper's first adjustment diverges then,
         # and most models grow nevertheless.
         if camera is not self._cameras[second]:
-            self.has_zoom = True
+            self.has_untried_pair = True
             return True
         inliers = self._matched.geometries[k].inlier_matches.T
         xy = [

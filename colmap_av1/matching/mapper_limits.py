@@ -1,4 +1,8 @@
-"""Default limits of COLMAP's mappers for using an image pair, starting with it, and going on."""
+"""Limits of COLMAP's mappers: default ones, and those of an initial pair that `match` chooses.
+
+They are the limits for using a pair of images, for beginning with it, and for registering further
+images.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,12 @@ INITIAL_MAX_FORWARD_MOTION = 0.95
 INITIAL_MIN_ANGLE = 16.0
 # If no pair has 8 degrees either, the mapper halves the angle again. Before that, it tries hundreds
 # or thousands of pairs, and RANSAC may give one of them a wrong pose with a large angle.
-INITIAL_LEAST_ANGLE = INITIAL_MIN_ANGLE / 4
+INITIAL_SMALL_ANGLE = INITIAL_MIN_ANGLE / 4
+# The mapper estimates the poses of pairs anew. It certainly accepts an initial pair whose inliers
+# and angle exceed its limits by this factor, with a translation along the optical axis that is
+# smaller than its limit by this tolerance.
+INITIAL_MARGIN = 1.1
+INITIAL_FORWARD_TOLERANCE = 0.02
 # Fewest points that an image must observe to be registered (abs_pose_min_num_inliers), and smallest
 # triangulation angle of a point in degrees (filter_min_tri_angle).
 REGISTRATION_MIN_INLIERS = 30
@@ -49,10 +58,10 @@ class InitialLimits:
 
 DEFAULT_LIMITS = InitialLimits()
 # For videos in which all angles are small.
-SMALL_ANGLES = InitialLimits(init_min_tri_angle=INITIAL_LEAST_ANGLE)
+SMALL_ANGLES = InitialLimits(init_min_tri_angle=INITIAL_SMALL_ANGLE)
 # For videos in which the camera moves along its axis, as on a drive: all angles are small, and the
 # motion excludes no pair.
-FORWARD_MOTION = InitialLimits(init_max_forward_motion=1.0, init_min_tri_angle=INITIAL_LEAST_ANGLE)
+FORWARD_MOTION = InitialLimits(init_max_forward_motion=1.0, init_min_tri_angle=INITIAL_SMALL_ANGLE)
 # If no pair meets its limits, the mapper halves the number of inliers, then the angle, then both
 # once more in this order.
 RELAXED_LIMITS = tuple(

@@ -318,8 +318,8 @@ def _start(tracks: Tracks, points: NDArray[np.float64], placed: PosedImages) -> 
     start = starting_pair(tracks.track, view, points, placed.images)
     if start is None:
         return None
-    step = -(-len(start.points) // _MAX_INITIAL_MATCHES)
-    return replace(start, points=start.points[::step])
+    chosen = evenly_spread(len(start.points), _MAX_INITIAL_MATCHES)
+    return replace(start, points=start.points[chosen])
 
 
 def _num_features(run: Run, image_set: ImageSet) -> float:

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.matching.mapper_limits import (
+    INITIAL_FORWARD_TOLERANCE,
+    INITIAL_MARGIN,
     INITIAL_MAX_FORWARD_MOTION,
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
@@ -25,11 +27,8 @@ from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
 
-# The mapper estimates pose and inliers itself, so that a pair that barely meets its limits may
-# fail.
-_MARGIN = 1.1
 _ENOUGH = round(1.5 * INITIAL_MIN_INLIERS)
-_FORWARD = INITIAL_MAX_FORWARD_MOTION - 0.02
+_FORWARD = INITIAL_MAX_FORWARD_MOTION - INITIAL_FORWARD_TOLERANCE
 # Number of images that are tried as the first of a pair, and distances in images to the second.
 _NUM_FIRST = 100
 _SPANS = (1, 2, 3, 4, 6, 8, 11, 15, 20, 28, 40, 56)
@@ -81,11 +80,11 @@ def starting_pair(
         images: the images with their poses.
 
     Returns:
-        The pair; None if the mapper would accept none, however it is matched.
+        The pair; None if no pair that is tried has enough such points.
     """
     candidates = list(_candidates(point, view, xyz, images))
     for share in (1, 1 / 2, 1 / 4):
-        angle = share * _MARGIN * INITIAL_MIN_ANGLE
+        angle = share * INITIAL_MARGIN * INITIAL_MIN_ANGLE
         for forward in (False, True):
             fit = [c for c in candidates if c.is_forward == forward]
             counts = [len(c.wide(angle)) for c in fit]
