@@ -240,6 +240,7 @@ def test_command_leaves_no_log_files_of_colmap(
     subprocess.run(
         [sys.executable, "-m", "colmap_av1", *words, "--output_path", tmp_path / "model"],
         env={**os.environ, "TMPDIR": str(temporary)},
+        cwd=tmp_path,
         check=True,
         capture_output=True,
     )
