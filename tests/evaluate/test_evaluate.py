@@ -69,6 +69,19 @@ def test_failing_call_raises_its_error_and_writes_a_log(tmp_path):
         run_measured(os._exit, 3, log=log)
 
 
+def _write_to_log_of_colmap(text):
+    pycolmap.logging.warning(text)
+
+
+def test_log_of_colmap_is_written_to_the_log_alone(tmp_path, monkeypatch):
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setenv("TMPDIR", str(temporary))
+    run_measured(_write_to_log_of_colmap, "no pairs", log=tmp_path / "log")
+    assert "no pairs" in (tmp_path / "log").read_text()
+    assert list(temporary.iterdir()) == []
+
+
 def _start(path):
     """Start a process that sleeps, write its id to a file, and wait for it."""
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])

@@ -102,12 +102,15 @@ def _call(
     bind(starter)
     if hasattr(os, "setpgid"):
         os.setpgid(0, 0)
+    # pycolmap would also log to files in the temporary folder. It is not imported for this, because
+    # the function may import torch, and the two crash in one process.
+    pycolmap = sys.modules.get("pycolmap")
+    if pycolmap is not None:
+        pycolmap.logging.logtostderr = True
     with log.open("ab") as file:
         # C++ libraries write to the file descriptors, not to sys.stdout and sys.stderr.
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    # pycolmap logs to that file alone.
-    os.environ["GLOG_logtostderr"] = "1"  # noqa: SIM112
     let_through()
     outcome: Measured[Any] | ColmapAv1Error | str
     start, cpu = time.perf_counter(), cpu_seconds()
