@@ -270,12 +270,13 @@ def match(
         )
         cameras = _listed_cameras(database, listed, images) if listed else None
         found = _match_images(images, cameras, scratch, options, context)
-        is_joint, is_assumed = isinstance(found, JointMatches), _has_assumed_focal_length(found)
+        joint = found if isinstance(found, JointMatches) else None
+        is_assumed = _has_assumed_focal_length(found)
         # The poses of pairs are wrong if a focal length is assumed.
-        known = found.poses if isinstance(found, JointMatches) and not is_assumed else ()
+        known = joint.poses if joint is not None and not is_assumed else ()
         start = prepare_start(found.matched, found.cameras, clock, known)
         # The estimate does not change the cameras of an existing database.
-        is_undetermined = cameras is None and is_joint and is_assumed
+        is_undetermined = cameras is None and joint is not None and is_assumed
         is_known_ahead = start.limits == FORWARD_MOTION and not is_assumed
         fixed_intrinsics = is_known_ahead or is_undetermined
         written = start.matched
@@ -320,7 +321,7 @@ def match(
     doubts = [crash, found.depth.warning, focal_length_warning(found.cameras)]
     # Few matches do not mean a gap if existing matches of the database may connect the images, or
     # with a joint estimate, which omits matches that only repeat tracks of other pairs.
-    if options.on_existing != "append" and not isinstance(found, JointMatches):
+    if options.on_existing != "append" and joint is None:
         doubts.append(matching_warning(found.matched, images.image_set))
     notes += tuple(doubt for doubt in doubts if doubt is not None)
     return MatchReport(
@@ -349,7 +350,7 @@ def match(
         small_angles=start.limits == SMALL_ANGLES,
         fixed_intrinsics=fixed_intrinsics,
         links=found.links,
-        estimate=found.estimate if isinstance(found, JointMatches) else None,
+        estimate=joint.estimate if joint is not None else None,
         seconds=clock.seconds,
         warnings=(*inputs.warnings, *notes, *blurred),
     )

@@ -148,11 +148,12 @@ def prepare_start(
             # Wrong pairs with smaller angles are demoted if the mapper would find them first.
             lowest_angle = max(lowest_angle, INITIAL_MIN_ANGLE / 2)
         is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * lowest_angle)
-        if known and is_certain and limits != DEFAULT_LIMITS:
-            is_bad |= found.is_far & (found.count < INITIAL_MARGIN * INITIAL_MIN_INLIERS)
         demote |= set(np.flatnonzero(is_bad).tolist())
         most, is_tried = _FEW_INLIERS, False
         if search is not None and is_certain:
+            if limits != DEFAULT_LIMITS:
+                has_few = found.is_far & (found.count < INITIAL_MARGIN * INITIAL_MIN_INLIERS)
+                demote |= set(np.flatnonzero(has_few).tolist())
             if limits == SMALL_ANGLES and len(known) == 1:
                 most = _LEAST_INLIERS - 1
             # The demoted pairs change the order of the others.
