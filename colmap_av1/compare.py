@@ -153,7 +153,7 @@ def compare(
             num_images=len(footage.names),
             size=footage.size,
             fixed_intrinsics=not settings.refine_intrinsics,
-            forward_motion=settings.forward_motion,
+            forward_motion=footage.forward_motion,
             cloud_reference=found.cloud_source,
             pose_reference=found.pose_source,
             is_truth=found.is_truth,

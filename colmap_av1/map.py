@@ -7,7 +7,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
@@ -47,6 +47,7 @@ class MapReport:
         output: folder of the models, one numbered folder each; 0 has the most images.
         database: the database.
         mapper: the mapper that was used.
+        forward_motion: whether it could begin with a pair that moves along the optical axis.
         num_images: number of images of the database.
         num_registered: number of registered images of each model, in descending order.
         place: coordinates of the model in folder 0: units, axes, origin and their source, as in
@@ -60,6 +61,7 @@ class MapReport:
     output: Path
     database: Path
     mapper: str
+    forward_motion: bool
     num_images: int
     num_registered: tuple[int, ...]
     place: Place
@@ -122,25 +124,15 @@ def map_database(
     try:
         with _log() as log, whole_folder(output, overwrite=overwrite) as partial:
             with clock.measure("poses"):
-                copy = partial / "mapped.db"
-                copy_database(database, copy)
-                num_registered = map_poses(
-                    copy,
-                    partial,
-                    options,
-                    image_path=image_path,
-                    log=log,
-                    num_images=checked.num_images,
-                    progress=progress,
+                num_registered, forward = _map(
+                    checked, image_path, partial, options, log=log, progress=progress
                 )
-                copy.unlink()
             if not num_registered:
                 raise ModelError(
                     f"{database}: COLMAP's {options.mapper} mapper finds no model, its images "
                     "share too few matches or have too little parallax: see 'colmap-av1 check' and "
                     f"{log}, try the other --mapper, or give --camera_params when matching"
                 )
-            shutil.copyfile(log, partial / "mapper.log")
             with clock.measure("place"):
                 placement = _place(partial, database, image_path, place, options.seed)
     except OSError as error:
@@ -166,6 +158,7 @@ def map_database(
         output=output,
         database=database,
         mapper=options.mapper,
+        forward_motion=forward,
         num_images=checked.num_images,
         num_registered=num_registered,
         place=placement.place,
@@ -174,6 +167,55 @@ def map_database(
         seconds=clock.seconds,
         warnings=tuple(warning for warning in warnings if warning is not None),
     )
+
+
+def _map(
+    checked: DatabaseCheck,
+    image_path: Path,
+    output: Path,
+    options: MapOptions,
+    *,
+    log: Path,
+    progress: Progress,
+) -> tuple[tuple[int, ...], bool]:
+    """Map, and choose whether the mapper may begin with forward motion unless it is given.
+
+    Returns:
+        Number of registered images of each model, in descending order. Whether the mapper could
+        begin with forward motion.
+    """
+    if options.mapper == "incremental" and options.forward_motion is None:
+        first = checked.parallax is not None and checked.parallax.is_forward
+        choices = [first, not first]
+    else:
+        choices = [bool(options.forward_motion)]
+    num_registered: tuple[int, ...] = ()
+    forward = choices[0]
+    # The copy is migrated to the schema of the installed COLMAP.
+    with tempfile.TemporaryDirectory(dir=output) as folder:
+        copy = Path(folder) / "mapped.db"
+        copy_database(checked.database, copy)
+        for own in choices:
+            models = Path(folder) / f"forward_{own:d}"
+            found = map_poses(
+                copy,
+                models,
+                replace(options, forward_motion=own),
+                image_path=image_path,
+                log=log,
+                num_images=checked.num_images,
+                progress=progress,
+            )
+            if found[:1] > num_registered[:1]:
+                for number in range(len(num_registered)):
+                    shutil.rmtree(output / str(number))
+                for number in range(len(found)):
+                    shutil.move(models / str(number), output)
+                shutil.copyfile(log, output / "mapper.log")
+                num_registered, forward = found, own
+            if found and 2 * found[0] >= checked.num_connected_images:
+                break
+    return num_registered, forward
 
 
 @contextmanager

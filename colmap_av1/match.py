@@ -144,7 +144,7 @@ class MatchReport:
         """Options for `map_database` with which the incremental mapper starts well."""
         angle = SMALL_ANGLES.init_min_tri_angle if self.small_angles else None
         return MapOptions(
-            forward_motion=self.forward_motion,
+            forward_motion=self.forward_motion or None,
             init_min_tri_angle=angle,
             refine_intrinsics=not self.fixed_intrinsics,
         )

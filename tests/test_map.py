@@ -14,10 +14,12 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from conftest import Encode
 from dense_scene import EVERY, NUM_IMAGES, SCENE, Truth
 from sequences import model_poses
 
 from colmap_av1 import (
+    CameraOptions,
     DatabaseError,
     DensityOptions,
     ImageError,
@@ -143,6 +145,42 @@ def test_intrinsics_are_kept_or_refined(database: Path, images: Path, tmp_path: 
     assert kept == given
     given, refined = focal_lengths(map_database(database, images, tmp_path / "b"))
     assert refined != given
+
+
+@pytest.mark.shared
+def test_options_for_forward_motion_are_chosen(
+    encode: Encode, shared: Path, tmp_path: Path
+) -> None:
+    """With default limits, the mapper has no initial pair of a drive."""
+    frames = sorted((shared / "sequences" / "street" / "frames").iterdir())[:12]
+    drive = encode(np.stack([cv2.imread(str(f)) for f in frames]), tmp_path / "drive.mp4")
+    matches = MatchOptions(camera=CameraOptions("PINHOLE", "707.0912,707.0912,602.3873,183.6104"))
+    match(tmp_path / "a.db", drive, image_path=tmp_path / "images", options=matches)
+
+    def mapped(
+        name: str, forward_motion: bool | None = None, mapper: Mapper = "incremental"
+    ) -> MapReport:
+        options = MapOptions(mapper=mapper, forward_motion=forward_motion)
+        return map_database(
+            tmp_path / name,
+            tmp_path / "images",
+            tmp_path / "model",
+            options=options,
+            overwrite=True,
+        )
+
+    known = mapped("a.db")
+    assert (known.forward_motion, known.num_registered) == (True, (12,))
+    assert mapped("a.db", mapper="global").num_registered == (12,)
+    with pytest.raises(ModelError):
+        mapped("a.db", forward_motion=False)
+    # Without a known focal length, the default limits are tried first.
+    shutil.copyfile(tmp_path / "a.db", tmp_path / "b.db")
+    with sqlite3.connect(tmp_path / "b.db") as connection:
+        connection.execute("UPDATE cameras SET prior_focal_length = 0")
+    connection.close()
+    unknown = mapped("b.db")
+    assert (unknown.forward_motion, unknown.num_registered) == (True, (12,))
 
 
 def test_initial_pair_has_the_given_angle(database: Path, images: Path, tmp_path: Path) -> None:

@@ -53,6 +53,11 @@ class Parallax:
     focal_known: bool
     forward_share: float
 
+    @property
+    def is_forward(self) -> bool:
+        """Whether the camera moves along its axis: most pairs are no initial pair of the mapper."""
+        return self.focal_known and self.forward_share > 0.5
+
 
 @dataclass(frozen=True)
 class Images:

@@ -323,7 +323,7 @@ def motion_findings(
             f"parallax of {parallax.angle:.1f} degrees: the incremental mapper starts sooner with "
             f"{' '.join(SMALL_ANGLES.words)}",
         )
-    if parallax.focal_known and parallax.forward_share > 0.5:
+    if parallax.is_forward:
         yield Finding(
             "warning",
             "the camera moves along its axis: the incremental mapper starts only with "

@@ -85,6 +85,7 @@ def map_rows(report: MapReport) -> Rows:
     figures = report.figures
     rows = [
         ("images registered", f"{figures.num_registered} of {report.num_images}"),
+        *([("motion", "forward")] if report.forward_motion else []),
         ("points", str(figures.num_points)),
         ("mean reprojection error", f"{figures.mean_error:.3f} px"),
         ("mean track length", f"{figures.mean_track_length:.2f}"),

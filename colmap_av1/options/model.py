@@ -83,17 +83,18 @@ class MapOptions(Options):
     Examples:
         >>> from colmap_av1 import MapOptions
         >>> options = MapOptions(mapper="global")
-        >>> options.mapper, options.forward_motion
-        ('global', False)
+        >>> options.mapper, options.refine_intrinsics
+        ('global', True)
     """
 
     title: ClassVar[str] = "mapper"
 
     mapper: Mapper = option("incremental", "COLMAP's mapper to use", common=True)
-    forward_motion: bool = option(
-        False,
+    forward_motion: bool | None = option(
+        None,
         "let the incremental mapper start with a pair that moves along the optical axis, and with "
-        "a small angle",
+        "a small angle; None: if most pairs of the database move so, or if less than half of the "
+        "connected images are registered otherwise",
         common=True,
     )
     init_min_tri_angle: float | None = option(
@@ -128,7 +129,7 @@ class MapOptions(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         of_initial_pair = {
-            "forward_motion": self.forward_motion,
+            "forward_motion": bool(self.forward_motion),
             "init_min_tri_angle": self.init_min_tri_angle is not None,
         }
         for name, is_given in of_initial_pair.items():
