@@ -127,6 +127,19 @@ def with_initial_intrinsics(camera: pycolmap.Camera) -> pycolmap.Camera:
     return initial
 
 
+def as_radial(camera: pycolmap.Camera) -> pycolmap.Camera:
+    """The same camera as a RADIAL one, from a SIMPLE_RADIAL one."""
+    radial = pycolmap.Camera(
+        camera_id=camera.camera_id,
+        model="RADIAL",
+        width=camera.width,
+        height=camera.height,
+        params=[*camera.params, 0.0],
+    )
+    radial.has_prior_focal_length = camera.has_prior_focal_length
+    return radial
+
+
 def is_undistorted(camera: pycolmap.Camera) -> bool:
     """Whether the model of a pycolmap.Camera has no distortion."""
     return camera.model_name in _UNDISTORTED

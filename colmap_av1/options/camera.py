@@ -39,8 +39,8 @@ class CameraOptions(Options):
     camera_model: str | None = option(
         None,
         "one of COLMAP's camera models; None: RADIAL if the focal length is recorded in the video "
-        "or can be estimated from the tracks, else SIMPLE_RADIAL; OPENCV, which has two focal "
-        "lengths, if pixels are not square",
+        "or can be estimated from the tracks, or if the images of a video show that the lens needs "
+        "it, else SIMPLE_RADIAL; OPENCV, which has two focal lengths, if pixels are not square",
         common=True,
     )
     camera_params: str | None = option(

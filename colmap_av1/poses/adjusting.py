@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.geometry.cameras import as_radial
 from colmap_av1.geometry.colmap_model import (
     ModelPoints,
     keep_observations,
@@ -21,8 +23,9 @@ from colmap_av1.geometry.colmap_model import (
     take_points,
     write_model,
 )
-from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
+from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors, robust_costs
 from colmap_av1.options import ReconstructOptions
+from colmap_av1.options.camera import DEFAULT_MODEL
 from colmap_av1.poses.mapper import ADJUSTMENT_STEPS, ADJUSTMENT_TOLERANCE, adjust_model
 from colmap_av1.poses.run import Run
 from colmap_av1.util.colmap_log import only_errors
@@ -42,6 +45,15 @@ _FEWEST_KEPT = 8
 # The covariance of intrinsics is estimated from at most this number of images and about this number
 # of observations of each, whose standard deviation in pixels is assumed.
 _COVARIANCE_IMAGES, _COVARIANCE_OBSERVATIONS, _OBSERVATION_ERROR = 200, 100, 0.25
+# A camera gets a second distortion parameter if at least this many images share it and the
+# parameter lowers the mean robust cost below this share. On clips of distorting lenses the share is
+# 0.967 to 0.997; on rendered ones without distortion, and on drives, which determine neither the
+# focal length nor the distortion, it is 0.999 to 1.
+SECOND_DISTORTION = (8, 0.998)
+# The focal length changes by up to a fifth then, and converges slowly.
+_DISTORTION_STEPS, _DISTORTION_TOLERANCE = 50, 1e-5
+# A larger parameter has diverged: COLMAP's mapper filters the images of such a camera.
+_MAX_DISTORTION = 1.0
 # Step of the phase in which consecutive points keep observations: the fractional part of the golden
 # ratio. Points that are observed in the same images then keep different ones.
 _PHASE_STEP = (5**0.5 - 1) / 2
@@ -129,6 +141,59 @@ def adjust_posed(
     ahead = np.isfinite(reprojection_errors(adjusted))
     points, enough = keep_observations(adjusted.points, ahead)
     return Adjusted(replace(adjusted, points=points), left[enough])
+
+
+def with_second_distortion(run: Run, model: PosedModel) -> PosedModel:
+    """Make cameras of the default model RADIAL if the images show that they need it.
+
+    A mapper that does not know the focal length begins with one distortion parameter, because a
+    pair of images rarely determines two. With many lenses, one parameter biases the focal length
+    and bends the path.
+
+    Args:
+        run: the run.
+        model: a model of the mapper, with points.
+
+    Returns:
+        The adjusted model; the given one if no camera needs a second parameter.
+    """
+    fewest_images, cost_share = SECOND_DISTORTION
+    num_images = Counter(image.camera_id for image in model.images)
+    numbers = {
+        number
+        for number, camera in model.cameras.items()
+        if camera.model_name == DEFAULT_MODEL and num_images[number] >= fewest_images
+    }
+    options = run.options
+    is_given = run.cameras is not None or options.match.camera.camera_model is not None
+    is_adjusted = options.mapping.adjust and refines_intrinsics(options)
+    if is_given or not is_adjusted or not numbers:
+        return model
+
+    def adjusted(own: PosedModel) -> PosedModel:
+        return adjust_posed(
+            run,
+            own,
+            loss_scales=LOSS_SCALES[-1:],
+            max_steps=_DISTORTION_STEPS,
+            tolerance=_DISTORTION_TOLERANCE,
+        ).model
+
+    simple = adjusted(model)
+    cameras = {i: as_radial(own) if i in numbers else own for i, own in simple.cameras.items()}
+    radial = adjusted(replace(simple, cameras=cameras))
+    distortion = [
+        abs(radial.cameras[i].params[j])
+        for i in numbers
+        for j in radial.cameras[i].extra_params_idxs()
+    ]
+    is_better = _mean_cost(radial) < cost_share * _mean_cost(simple)
+    return radial if is_better and max(distortion) <= _MAX_DISTORTION else model
+
+
+def _mean_cost(model: PosedModel) -> float:
+    """Mean robust cost of an observation with the scale of the last adjustment."""
+    return float(robust_costs(reprojection_errors(model), LOSS_SCALES[-1]).mean())
 
 
 def focal_length_errors(model: PosedModel) -> dict[int, float]:

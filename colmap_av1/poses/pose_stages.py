@@ -34,8 +34,10 @@ from colmap_av1.options import DensityOptions, MapOptions, TriangulateOptions
 from colmap_av1.poses.adjusting import (
     LOSS_SCALES,
     OBSERVATIONS,
+    SECOND_DISTORTION,
     adjust_posed,
     refines_intrinsics,
+    with_second_distortion,
 )
 from colmap_av1.poses.mapper import FEW_SEEN, map_poses, without_unseen_images
 from colmap_av1.poses.match_stage import MatchesResult
@@ -168,11 +170,12 @@ def pose_stage(
                 progress=progress,
                 ends_early=ends_early,
             )
-            return [
-                posed_model(read_model(Path(models) / str(number)))
+            found = [
+                posed_model(read_model(Path(models) / str(number)), with_points=True)
                 for number, size in enumerate(sizes)
                 if size >= LEAST_IMAGES
             ]
+        return [with_second_distortion(run, model) for model in found]
 
     def make(partial: Path) -> MappedResult:
         with clock.measure("poses"):
@@ -196,7 +199,7 @@ def pose_stage(
         (partial / "poses").mkdir()
         files = [f"poses/{number}.npz" for number in range(len(found))]
         for file, model in zip(files, found, strict=True):
-            write_posed_model(partial / file, model)
+            write_posed_model(partial / file, PosedModel(model.cameras, model.images))
         return MappedResult(
             poses=files[0],
             num_registered=len(found[0].images),
@@ -208,7 +211,15 @@ def pose_stage(
     return run_stage(
         run.stages,
         "poses",
-        [matched.digest, attempts, START_TRACKS, mapping.adjust, ends_early, pycolmap.__version__],
+        [
+            matched.digest,
+            attempts,
+            START_TRACKS,
+            mapping.adjust,
+            ends_early,
+            SECOND_DISTORTION,
+            pycolmap.__version__,
+        ],
         MappedResult,
         into=run.stages,
         products=["poses"],

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from colmap_av1 import CameraOptions, MatchOptions, ReconstructOptions
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import (
     ModelImage,
@@ -25,7 +26,12 @@ from colmap_av1.geometry.colmap_model import (
 )
 from colmap_av1.geometry.posed_model import PosedModel, posed_model, reprojection_errors
 from colmap_av1.poses import adjusting
-from colmap_av1.poses.adjusting import adjust_posed, focal_length_errors, used_observations
+from colmap_av1.poses.adjusting import (
+    adjust_posed,
+    focal_length_errors,
+    used_observations,
+    with_second_distortion,
+)
 from colmap_av1.reconstruct import ReconstructReport
 
 
@@ -80,36 +86,72 @@ def test_points_with_one_observation_are_dropped() -> None:
     assert left.image.tolist() == [0, 1, 2, 3, 4]
 
 
-def test_focal_length_is_observable_with_turns_but_not_on_a_straight_path() -> None:
+def posed_scene(camera: pycolmap.Camera, turn: float) -> PosedModel:
+    """Exact observations of random points by a camera that turns by some degrees per image."""
     rng = np.random.default_rng(0)
     xyz = rng.uniform(-1, 1, (4000, 3)) * [8, 3, 40]
+    images, seen = [], list[tuple[int, int, float, float]]()
+    for i in range(12):
+        rotation = Rotation.from_euler("y", turn * i, degrees=True).as_matrix()
+        pose = np.column_stack([rotation, rotation @ [0.1 * i, 0, -0.3 * i]])
+        images.append(ModelImage(i + 1, f"{i:02}.png", 1, pose))
+        x = xyz @ pose[:, :3].T + pose[:, 3]
+        xy = camera.img_from_cam(np.where(x[:, 2:] > 1, x, np.nan))
+        there = np.flatnonzero(((xy > 0) & (xy < [640, 480])).all(axis=1))
+        seen += [(k, i, *xy[k]) for k in there.tolist()]
+    rows = np.array(sorted(seen))
+    counts = np.bincount(rows[:, 0].astype(int), minlength=len(xyz))
+    points = ModelPoints(
+        xyz,
+        np.zeros((len(xyz), 3), np.uint8),
+        np.zeros(len(xyz)),
+        np.cumsum([0, *counts]),
+        rows[:, 1].astype(np.int64),
+        rows[:, 2:],
+    )
+    several = keep_observations(points, np.repeat(counts >= 3, counts))[0]
+    return PosedModel({1: camera}, images, several)
+
+
+def test_focal_length_is_observable_with_turns_but_not_on_a_straight_path() -> None:
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 500.0, 640, 480)
-    errors = {}
-    for turn in (0.0, 6.0):  # degrees per image
-        images, seen = [], list[tuple[int, int, float, float]]()
-        for i in range(12):
-            rotation = Rotation.from_euler("y", turn * i, degrees=True).as_matrix()
-            pose = np.column_stack([rotation, rotation @ [0.1 * i, 0, -0.3 * i]])
-            images.append(ModelImage(i + 1, f"{i:02}.png", 1, pose))
-            x = xyz @ pose[:, :3].T + pose[:, 3]
-            xy = camera.img_from_cam(np.where(x[:, 2:] > 1, x, np.nan))
-            there = np.flatnonzero(((xy > 0) & (xy < [640, 480])).all(axis=1))
-            seen += [(k, i, *xy[k]) for k in there.tolist()]
-        rows = np.array(sorted(seen))
-        counts = np.bincount(rows[:, 0].astype(int), minlength=len(xyz))
-        points = ModelPoints(
-            xyz,
-            np.zeros((len(xyz), 3), np.uint8),
-            np.zeros(len(xyz)),
-            np.cumsum([0, *counts]),
-            rows[:, 1].astype(np.int64),
-            rows[:, 2:],
-        )
-        several = keep_observations(points, np.repeat(counts >= 3, counts))[0]
-        errors[turn] = focal_length_errors(PosedModel({1: camera}, images, several))[1]
+    errors = {turn: focal_length_errors(posed_scene(camera, turn))[1] for turn in (0.0, 6.0)}
     assert errors[6.0] < 0.005
     # Infinite in exact arithmetic; rounding may make it finite.
     assert errors[0.0] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("distortion", "options", "is_better"),
+    [
+        ((-0.24, 0.06), CameraOptions(), True),
+        ((-0.24, 0.0), CameraOptions(), False),
+        ((-0.24, 0.06), CameraOptions(camera_model="SIMPLE_RADIAL"), False),
+    ],
+)
+def test_second_distortion_parameter_is_added_if_the_lens_needs_it(
+    distortion: tuple[float, float], options: CameraOptions, is_better: bool, tmp_path: Path
+) -> None:
+    lens = pycolmap.Camera(
+        camera_id=1, model="RADIAL", width=640, height=480, params=[400, 320, 240, *distortion]
+    )
+    exact = posed_scene(lens, 6.0)
+    noise = np.random.default_rng(0).normal(0, 0.2, exact.points.xy.shape)
+    assumed = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 430.0, 640, 480)
+    model = PosedModel(
+        {1: assumed}, exact.images, replace(exact.points, xy=exact.points.xy + noise)
+    )
+    run = SimpleNamespace(
+        options=ReconstructOptions(match=MatchOptions(camera=options)),
+        cameras=None,
+        stages=tmp_path,
+    )
+    found = with_second_distortion(run, model)
+    if is_better:
+        assert found.cameras[1].model_name == "RADIAL"
+        assert found.cameras[1].params == pytest.approx(lens.params, rel=0.05)
+    else:
+        assert found is model
 
 
 def test_adjustment_recovers_poses_from_half_of_the_observations(
