@@ -359,7 +359,7 @@ def _paired(
         tracks.append(own.tracks.keep_observations(kept))
         if own.start is not None:
             # Tracks without a kept observation are gone, which changes the numbers of the others.
-            is_kept = np.add.reduceat(kept, own.tracks.offsets[:-1]) > 0
+            is_kept = own.tracks.having(kept)
             views = own.placed.frames[[own.start.first, own.start.second]]
             first, second = np.searchsorted(frames, views).tolist()
             points = np.cumsum(is_kept)[own.start.points] - 1 + num_tracks

@@ -167,7 +167,7 @@ def start_mapper(
         options: options of the mapper.
         num_images: number of images at which the mapper is stopped.
         log: file for the output of the mapper.
-        initial_pair: limits for the initial pair, in addition to the options.
+        initial_pair: limits for the initial pair, by the names of the mapper's options.
 
     Returns:
         Names of the images of a first model that remains smaller, none if the mapper starts none;
@@ -177,8 +177,7 @@ def start_mapper(
         ModelError: the mapper failed; the log holds the details.
     """
     settings = _mapping_settings(database, database.parent, options, None)
-    settings |= {"task": "start", "num_images": num_images}
-    settings["initial_pair"] = {**initial_pair, **settings["initial_pair"]}
+    settings |= {"task": "start", "num_images": num_images, "initial_pair": initial_pair}
     names: list[str] | None = None
 
     def hear(word: str, value: str) -> None:

@@ -62,7 +62,7 @@ def matched_observations(
     kept = spread_observations(tracks, _LONGEST)
     keeps_all = is_needed | (is_corner & _is_short_or_revisited(tracks, view))
     kept |= np.repeat(keeps_all, tracks.lengths)
-    is_matched = np.add.reduceat(kept, tracks.offsets[:-1]) > 0
+    is_matched = tracks.having(kept)
     three = _three_observations(tracks, view)
     three[np.repeat(is_matched, tracks.lengths)] = False
     three[three] = spread_observations(tracks.keep_observations(three), limits)

@@ -49,7 +49,7 @@ def at_same_place(tracks: Tracks, others: Tracks, distance: float) -> NDArray[np
 
     around = np.array([dy * columns + dx for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
     is_there = np.isin(cells(tracks), (cells(others)[:, None] + around).ravel())
-    return np.add.reduceat(is_there, tracks.offsets[:-1]) > 0
+    return tracks.having(is_there)
 
 
 def pair_by_tracks(

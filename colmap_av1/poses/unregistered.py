@@ -37,8 +37,7 @@ def tracks_of_unregistered(
     motion = select_tracks(pose_tracks(run, posed.tracks).keep_frames(frames), density)
     seen = Tracks.concatenate(motion, posed.links.keep_frames(frames))
     is_left = np.isin(seen.frame, [frame_of[name] for name in left])
-    touching = np.add.reduceat(is_left, seen.offsets[:-1]) > 0
-    return seen.keep_tracks(touching)
+    return seen.keep_tracks(seen.having(is_left))
 
 
 def within_models(

@@ -145,6 +145,16 @@ class Tracks:
         """Order of the observations by frame, and the bounds of the frames in it, see `grouped`."""
         return grouped(self.frame, self.num_frames)
 
+    def having(self, observations: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which tracks have any of these observations: bool [num_tracks].
+
+        Args:
+            observations: bool [num_observations].
+        """
+        if self.num_tracks == 0:
+            return np.zeros(0, np.bool_)
+        return np.logical_or.reduceat(observations, self.offsets[:-1])
+
     def keep_observations(self, kept: NDArray[np.bool_]) -> Tracks:
         """Keep some of the observations.
 
