@@ -189,32 +189,30 @@ def _map(
         choices = [first, not first]
     else:
         choices = [bool(options.forward_motion)]
-    num_registered: tuple[int, ...] = ()
-    forward = choices[0]
+    attempts = list[tuple[tuple[int, ...], bool, Path]]()
     # The copy is migrated to the schema of the installed COLMAP.
     with tempfile.TemporaryDirectory(dir=output) as folder:
         copy = Path(folder) / "mapped.db"
         copy_database(checked.database, copy)
-        for own in choices:
-            models = Path(folder) / f"forward_{own:d}"
-            found = map_poses(
+        for forward in choices:
+            models = Path(folder) / f"forward_{forward:d}"
+            num_registered = map_poses(
                 copy,
                 models,
-                replace(options, forward_motion=own),
+                replace(options, forward_motion=forward),
                 image_path=image_path,
                 log=log,
                 num_images=checked.num_images,
                 progress=progress,
             )
-            if found[:1] > num_registered[:1]:
-                for number in range(len(num_registered)):
-                    shutil.rmtree(output / str(number))
-                for number in range(len(found)):
-                    shutil.move(models / str(number), output)
-                shutil.copyfile(log, output / "mapper.log")
-                num_registered, forward = found, own
-            if found and 2 * found[0] >= checked.num_connected_images:
+            shutil.copyfile(log, models / "mapper.log")
+            attempts.append((num_registered, forward, models))
+            if num_registered and 2 * num_registered[0] >= checked.num_connected_images:
                 break
+        # The first of two models of the same size is kept.
+        num_registered, forward, models = max(attempts, key=lambda attempt: attempt[0][:1])
+        for made in list(models.iterdir()):
+            shutil.move(made, output)
     return num_registered, forward
 
 

@@ -6,14 +6,18 @@ import os
 import shutil
 import subprocess
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
+import cv2
 import imageio_ffmpeg
 import numpy as np
 import pytest
 from dense_scene import made, truth  # noqa: F401 - fixtures
 from hypothesis import settings
 from numpy.typing import NDArray
+
+from colmap_av1 import CameraOptions
 
 PROJECT = Path(__file__).resolve().parents[1]
 SHARED = PROJECT.parent / "shared"
@@ -42,6 +46,10 @@ settings.load_profile("tests")
 
 Ffmpeg = Callable[..., Path]
 Encode = Callable[..., Path]
+Street = Callable[[int], Path]
+
+# The camera of `street`.
+STREET = CameraOptions("PINHOLE", "707.0912,707.0912,602.3873,183.6104")
 
 
 def pytest_configure() -> None:
@@ -92,6 +100,19 @@ def encode(ffmpeg: Ffmpeg) -> Encode:
         source = f"-f rawvideo -pix_fmt bgr24 -s {width}x{height} -r 25 -i -".split()
         how = how or tuple(AV1)
         return ffmpeg(*source, *how, "-pix_fmt", "yuv420p", output, stdin=frames.tobytes())
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def street(shared: Path, encode: Encode, tmp_path_factory: pytest.TempPathFactory) -> Street:
+    """Encode the first frames of a drive, by their number; `STREET` is its camera."""
+
+    @cache
+    def run(num_frames: int) -> Path:
+        frames = sorted((shared / "sequences" / "street" / "frames").iterdir())[:num_frames]
+        output = tmp_path_factory.mktemp("street") / "drive.mp4"
+        return encode(np.stack([cv2.imread(str(frame)) for frame in frames]), output)
 
     return run
 

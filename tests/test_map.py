@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from conftest import Encode
+from conftest import STREET, Street
 from dense_scene import EVERY, NUM_IMAGES, SCENE, Truth
 from sequences import model_poses
 
 from colmap_av1 import (
-    CameraOptions,
     DatabaseError,
     DensityOptions,
     ImageError,
@@ -148,14 +147,10 @@ def test_intrinsics_are_kept_or_refined(database: Path, images: Path, tmp_path: 
 
 
 @pytest.mark.shared
-def test_options_for_forward_motion_are_chosen(
-    encode: Encode, shared: Path, tmp_path: Path
-) -> None:
+def test_options_for_forward_motion_are_chosen(street: Street, tmp_path: Path) -> None:
     """With default limits, the mapper has no initial pair of a drive."""
-    frames = sorted((shared / "sequences" / "street" / "frames").iterdir())[:12]
-    drive = encode(np.stack([cv2.imread(str(f)) for f in frames]), tmp_path / "drive.mp4")
-    matches = MatchOptions(camera=CameraOptions("PINHOLE", "707.0912,707.0912,602.3873,183.6104"))
-    match(tmp_path / "a.db", drive, image_path=tmp_path / "images", options=matches)
+    options = MatchOptions(camera=STREET)
+    match(tmp_path / "a.db", street(12), image_path=tmp_path / "images", options=options)
 
     def mapped(
         name: str, forward_motion: bool | None = None, mapper: Mapper = "incremental"

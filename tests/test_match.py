@@ -15,7 +15,16 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from conftest import AV1, PROJECT, Encode, Ffmpeg, encode_two_sizes, make_frames
+from conftest import (
+    AV1,
+    PROJECT,
+    STREET,
+    Encode,
+    Ffmpeg,
+    Street,
+    encode_two_sizes,
+    make_frames,
+)
 from databases import keypoints_of
 
 from colmap_av1.cli import main
@@ -536,12 +545,8 @@ def test_focal_length_that_a_short_clip_does_not_determine_is_kept(
 
 
 @pytest.mark.shared
-def test_drive_with_unknown_intrinsics_is_mapped(
-    encode: Encode, shared: Path, tmp_path: Path
-) -> None:
-    frames = sorted((shared / "sequences" / "street" / "frames").iterdir())[:20]
-    drive = encode(np.stack([cv2.imread(str(f)) for f in frames]), tmp_path / "drive.mp4")
-    report = match(tmp_path / "a.db", drive, image_path=tmp_path / "frames")
+def test_drive_with_unknown_intrinsics_is_mapped(street: Street, tmp_path: Path) -> None:
+    report = match(tmp_path / "a.db", street(20), image_path=tmp_path / "frames")
     assert report.estimate is not None
     assert report.focal_length == pytest.approx(707, rel=0.15)
     options = replace(report.map_options, num_threads=1)
@@ -552,14 +557,10 @@ def test_drive_with_unknown_intrinsics_is_mapped(
 
 
 @pytest.mark.shared
-def test_forward_motion_is_detected(
-    encode: Encode, clip: Path, shared: Path, tmp_path: Path
-) -> None:
+def test_forward_motion_is_detected(street: Street, clip: Path, tmp_path: Path) -> None:
     """Commands for a drive have the mapper's options for it, those for sideways motion do not."""
-    frames = sorted((shared / "sequences" / "street" / "frames").iterdir())[:12]
-    drive = encode(np.stack([cv2.imread(str(f)) for f in frames]), tmp_path / "drive.mp4")
-    street = CameraOptions("PINHOLE", "707.0912,707.0912,602.3873,183.6104")
-    report = match(tmp_path / "a.db", drive, options=MatchOptions(camera=street))
+    drive = street(12)
+    report = match(tmp_path / "a.db", drive, options=MatchOptions(camera=STREET))
     assert report.forward_motion
     assert "--Mapper.init_max_forward_motion 1" in report.next_commands[0]
     assert "--Mapper.init_min_tri_angle 4" in report.next_commands[0]

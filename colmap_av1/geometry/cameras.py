@@ -129,14 +129,9 @@ def with_initial_intrinsics(camera: pycolmap.Camera) -> pycolmap.Camera:
 
 def as_radial(camera: pycolmap.Camera) -> pycolmap.Camera:
     """The same camera as a RADIAL one, from a SIMPLE_RADIAL one."""
-    radial = pycolmap.Camera(
-        camera_id=camera.camera_id,
-        model="RADIAL",
-        width=camera.width,
-        height=camera.height,
-        params=[*camera.params, 0.0],
-    )
-    radial.has_prior_focal_length = camera.has_prior_focal_length
+    radial = copy.copy(camera)
+    radial.model = pycolmap.CameraModelId.RADIAL
+    radial.params = [*camera.params, 0.0]
     return radial
 
 

@@ -187,13 +187,14 @@ def with_second_distortion(run: Run, model: PosedModel) -> PosedModel:
         for i in numbers
         for j in radial.cameras[i].extra_params_idxs()
     ]
-    is_better = _mean_cost(radial) < cost_share * _mean_cost(simple)
+    simple_cost, radial_cost = (mean_cost(reprojection_errors(own)) for own in (simple, radial))
+    is_better = radial_cost < cost_share * simple_cost
     return radial if is_better and max(distortion) <= _MAX_DISTORTION else model
 
 
-def _mean_cost(model: PosedModel) -> float:
-    """Mean robust cost of an observation with the scale of the last adjustment."""
-    return float(robust_costs(reprojection_errors(model), LOSS_SCALES[-1]).mean())
+def mean_cost(errors: NDArray[np.float64]) -> float:
+    """Mean Cauchy loss of errors in pixels, with the scale of the last adjustment."""
+    return float(robust_costs(errors, LOSS_SCALES[-1]).mean())
 
 
 def focal_length_errors(model: PosedModel) -> dict[int, float]:

@@ -22,7 +22,6 @@ from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matched_images
 from colmap_av1.errors import ModelError
@@ -33,7 +32,6 @@ from colmap_av1.geometry.posed_model import (
     posed_model,
     read_posed_model,
     reprojection_errors,
-    robust_costs,
     write_posed_model,
 )
 from colmap_av1.geometry.track_points import seen_in, to_model_points
@@ -41,7 +39,12 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.image_matches import verify_images
 from colmap_av1.matching.pairs import covisible_pairs
 from colmap_av1.options import MapOptions
-from colmap_av1.poses.adjusting import LOSS_SCALES, adjust_posed, refines_intrinsics
+from colmap_av1.poses.adjusting import (
+    LOSS_SCALES,
+    adjust_posed,
+    mean_cost,
+    refines_intrinsics,
+)
 from colmap_av1.poses.mapper import map_poses
 from colmap_av1.poses.pose_stages import (
     FROM_PICTURES,
@@ -250,11 +253,6 @@ def _costs(
     known_errors = reprojection_errors(known)[in_both][agreeing.observation]
     return (
         len(agreeing.observation) / len(view),
-        _mean_cost(known_errors),
-        _mean_cost(reprojection_errors(adjusted)),
+        mean_cost(known_errors),
+        mean_cost(reprojection_errors(adjusted)),
     )
-
-
-def _mean_cost(errors: NDArray[np.float64]) -> float:
-    """Mean Cauchy loss of errors in pixels, with the scale of the last adjustment."""
-    return float(robust_costs(errors, LOSS_SCALES[-1]).mean())

@@ -151,8 +151,6 @@ class Tracks:
         Args:
             observations: bool [num_observations].
         """
-        if self.num_tracks == 0:
-            return np.zeros(0, np.bool_)
         return np.logical_or.reduceat(observations, self.offsets[:-1])
 
     def keep_observations(self, kept: NDArray[np.bool_]) -> Tracks:

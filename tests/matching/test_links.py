@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from conftest import PROJECT, QUICK_AV1, Encode, make_frames
+from conftest import PROJECT, QUICK_AV1, STREET, Encode, Street, make_frames
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -32,7 +32,6 @@ from colmap_av1.matching.links.matching import Links
 from colmap_av1.matching.links.merging import links_as_tracks
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import (
-    CameraOptions,
     ImageOptions,
     LinkOptions,
     MatchOptions,
@@ -221,13 +220,11 @@ def test_no_picture_is_decoded_if_motion_connects_all_images(
 
 @pytest.mark.shared
 def test_no_picture_of_a_drive_with_rigid_motion_is_compared(
-    shared: Path, encode: Encode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    street: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Half of the units are intra coded, but nearly all motion vectors fit a rigid scene."""
-    frames = sorted((shared / "sequences" / "street" / "frames").iterdir())[:9]
-    drive = encode(np.array([cv2.imread(str(f)) for f in frames]), tmp_path / "drive.mp4")
-    street = CameraOptions("PINHOLE", "707.0912,707.0912,602.3873,183.6104")
-    options = MatchOptions(camera=street, images=ImageOptions(every=1))
+    drive = street(9)
+    options = MatchOptions(camera=STREET, images=ImageOptions(every=1))
     assert match(tmp_path / "a.db", drive, options=options).links.num_images == 0
     monkeypatch.setattr("colmap_av1.matching.gaps._RIGID_SHARE", 1.1)
     assert match(tmp_path / "b.db", drive, options=options).links.num_images > 0
