@@ -93,6 +93,24 @@ def test_libaom_speeds_above_8_change_the_stream(phone: Path, tmp_path: Path) ->
         find_encoder(EncodeOptions(encoder="libaom", speed=99))
 
 
+def test_quick_stream_of_a_turning_camera_can_be_decoded(
+    shared: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """libaom writes invalid streams if it updates no costs of symbols and uses warps."""
+    clip = shared / "sequences" / "log_building" / "clip.mp4"
+    picture = ffmpeg("-i", clip, "-frames:v", "1", tmp_path / "still.png")
+    turn = "scale=640:360,rotate='0.3*sin(t*t/8)'"
+    turning = ffmpeg(
+        *("-loop", "1", "-r", "60", "-i", picture, "-frames:v", "400", "-vf", turn),
+        *("-c:v", "ffv1", "-pix_fmt", "yuv420p"),
+        tmp_path / "turning.mkv",
+    )
+    options = EncodeOptions("libaom", effort="quick")
+    stream = encode_video(turning, tmp_path / "turning.mp4", options=options).output
+    assert len(list(read_motion(stream))) == 400
+    assert sum(1 for _ in decode_frames(stream)) == 400
+
+
 def test_quick_stream_is_reused_unless_full_effort_is_requested(
     phone: Path, tmp_path: Path
 ) -> None:
