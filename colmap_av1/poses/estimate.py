@@ -49,6 +49,8 @@ _Decision = TypeVar("_Decision")
 _FIRST_SPLIT = 3
 # A second mapping of the first model must agree with this share of the observations.
 _LEAST_KEPT = 0.9
+# Poses without further links are used only if they have this share of the images of the others.
+_LEAST_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -136,16 +138,16 @@ class _FirstModel:
 
 @dataclass(frozen=True)
 class _ToMend:
-    """Signs that the first poses are wrong.
+    """Where links are looked for again, because the first poses seem wrong.
 
     Attributes:
         doubted: frames after doubtful seams where no links were looked for.
-        apart: whether pictures far apart in time contradict the poses, and loop closures were not
-            looked for.
+        loops: whether to look for loop closures, because pictures far apart in time contradict the
+            poses, and none were looked for.
     """
 
-    doubted: tuple[int, ...]
-    apart: bool
+    doubted: tuple[int, ...] = ()
+    loops: bool = False
 
 
 def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> Posed:
@@ -153,7 +155,9 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
 
     Links replace motion at doubtful seams. Loop closures are looked for if pictures far apart in
     time contradict the poses. A model that is still poorly connected is split, see `parts`. If
-    another of the mapper's models is larger than the largest part, it becomes the first.
+    pictures contradict only the poses with all links, those without are used: links at a fast turn
+    may follow an object that moves with the camera. If another of the mapper's models is larger
+    than the largest part, it becomes the first.
     """
     options = run.options
     key = [
@@ -167,7 +171,7 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
     ]
 
     def run_with_links(found: _ToMend) -> Run:
-        return _with_all_links(run) if found.apart else run
+        return _with_all_links(run) if found.loops else run
 
     # The caches hold only the last result, because estimates are large. A resumed run whose
     # decisions are stored makes only the final estimate.
@@ -184,11 +188,20 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         return split_at_seams(run_with_links(found), pose(found, first), image_set)
 
     def look_for_errors(_: Path) -> _ToMend:
-        once = pose(_ToMend(doubted=(), apart=False), None)
+        once = pose(_ToMend(), None)
         return _ToMend(
             doubted=tuple(_unlinked_seams(run, image_set, once)),
-            apart=_are_unlinked_and_apart(run, once),
+            loops=_are_unlinked_and_apart(run, once),
         )
+
+    def compare_poses(_: Path) -> _ToMend:
+        mended = split(errors, None)
+        if errors == _ToMend() or not _are_apart(mended):
+            return errors
+        size = mended.last.result.num_registered
+        once = split(_ToMend(), None)
+        is_large = once.last.result.num_registered >= _LEAST_SHARE * size
+        return _ToMend() if is_large and not _are_apart(once) else errors
 
     def compare_models(_: Path) -> _FirstModel:
         largest_part = split(found, None)
@@ -205,11 +218,11 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
             posed = split(found, other)
         except ModelError:  # too few tracks agree with its poses
             return _FirstModel(None)
-        is_apart = posed.long_range is not None and posed.long_range.result.apart
         is_larger = posed.last.result.num_registered > size
-        return _FirstModel(other if is_larger and not is_apart else None)
+        return _FirstModel(other if is_larger and not _are_apart(posed) else None)
 
-    found = _decided(run, "seams", key, _ToMend, look_for_errors)
+    errors = _decided(run, "seams", key, _ToMend, look_for_errors)
+    found = _decided(run, "mended", [key, errors], _ToMend, compare_poses)
     first = _decided(run, "first_model", [key, found], _FirstModel, compare_models).file
     return split(found, first)
 
@@ -247,7 +260,7 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
             break
         adjusted = posed.adjustment.result
         seams: Sequence[tuple[str, str]] = adjusted.few_point_seams
-        if posed.long_range is not None and posed.long_range.result.apart:
+        if _are_apart(posed):
             seams = adjusted.doubtful_seams
         seams = sorted({*seams, *adjusted.scale_lost_seams})
         if not seams:
@@ -276,11 +289,15 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
     return posed
 
 
+def _are_apart(posed: Posed) -> bool:
+    """Whether pictures far apart in time contradict the poses."""
+    return posed.long_range is not None and posed.long_range.result.apart
+
+
 def _are_unlinked_and_apart(run: Run, posed: Posed) -> bool:
     """Whether pictures far apart contradict the poses, and no loop closures were looked for."""
-    assert posed.long_range is not None
     looked = run.options.match.links.links != "auto" or posed.matches.result.links.looked_again
-    return posed.long_range.result.apart and not looked
+    return _are_apart(posed) and not looked
 
 
 def _with_all_links(run: Run) -> Run:

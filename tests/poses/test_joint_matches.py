@@ -33,7 +33,7 @@ from colmap_av1.options import (
     RunOptions,
     VerifyOptions,
 )
-from colmap_av1.poses import long_range
+from colmap_av1.poses import estimate, long_range
 from colmap_av1.poses.starting_pair import starting_pair
 from colmap_av1.video.decoding import decode_frames
 
@@ -154,6 +154,26 @@ def test_matches_of_a_doubtful_joint_estimate_are_kept_with_a_warning(
     assert any("contradict" in warning for warning in report.warnings)
     model = mapped(report.database, joint.image_path)
     assert model.num_reg_images() == joint.num_images
+
+
+@pytest.mark.parametrize("is_wrong", [False, True])
+def test_links_that_images_contradict_are_not_used(
+    joint: MatchReport,
+    scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    is_wrong: bool,
+) -> None:
+    """Links at a doubtful seam replace motion unless images contradict only poses with them."""
+    monkeypatch.setattr(estimate, "_unlinked_seams", lambda run, image_set, posed: [30])
+    monkeypatch.setattr(
+        estimate, "_are_apart", lambda posed: is_wrong and bool(posed.matches.result.links.gaps)
+    )
+    report = match(tmp_path / "a.db", scene, image_path=joint.image_path, options=OPTIONS)
+    assert not joint.links.gaps
+    assert bool(report.links.gaps) != is_wrong
+    assert report.estimate is not None
+    assert report.estimate.num_registered == (joint.num_images,)
 
 
 def test_same_input_gives_the_same_database(
