@@ -150,6 +150,19 @@ class _ToMend:
     loops: bool = False
 
 
+@dataclass(frozen=True)
+class _FirstPoses:
+    """What the first poses tell.
+
+    Attributes:
+        errors: where links are looked for again.
+        may_be_right: whether pictures agree with the poses, or may agree after a split.
+    """
+
+    errors: _ToMend
+    may_be_right: bool
+
+
 def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> Posed:
     """Estimate poses, and if they are doubtful estimate them again with SIFT links.
 
@@ -187,16 +200,19 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
     def split(found: _ToMend, first: str | None) -> Posed:
         return split_at_seams(run_with_links(found), pose(found, first), image_set)
 
-    def look_for_errors(_: Path) -> _ToMend:
+    def look_for_errors(_: Path) -> _FirstPoses:
         once = pose(_ToMend(), None)
-        return _ToMend(
+        errors = _ToMend(
             doubted=tuple(_unlinked_seams(run, image_set, once)),
             loops=_are_unlinked_and_apart(run, once),
         )
+        return _FirstPoses(errors, not _are_apart(once) or bool(_seams_to_split(once)))
 
     def compare_poses(_: Path) -> _ToMend:
+        if errors == _ToMend() or not first_poses.may_be_right:
+            return errors
         mended = split(errors, None)
-        if errors == _ToMend() or not _are_apart(mended):
+        if not _are_apart(mended):
             return errors
         size = mended.last.result.num_registered
         once = split(_ToMend(), None)
@@ -221,8 +237,9 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         is_larger = posed.last.result.num_registered > size
         return _FirstModel(other if is_larger and not _are_apart(posed) else None)
 
-    errors = _decided(run, "seams", key, _ToMend, look_for_errors)
-    found = _decided(run, "mended", [key, errors], _ToMend, compare_poses)
+    first_poses = _decided(run, "seams", key, _FirstPoses, look_for_errors)
+    errors = first_poses.errors
+    found = _decided(run, "mended", [key, first_poses], _ToMend, compare_poses)
     first = _decided(run, "first_model", [key, found], _FirstModel, compare_models).file
     return split(found, first)
 
@@ -256,14 +273,8 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
     may be wrong there. Links are: without them, a part that returns to a place would fall apart.
     """
     for number in count(_FIRST_SPLIT):
-        if posed.adjustment is None:
-            break
-        adjusted = posed.adjustment.result
-        seams: Sequence[tuple[str, str]] = adjusted.few_point_seams
-        if _are_apart(posed):
-            seams = adjusted.doubtful_seams
-        seams = sorted({*seams, *adjusted.scale_lost_seams})
-        if not seams:
+        seams = _seams_to_split(posed)
+        if posed.adjustment is None or not seams:
             break
         parts = split_stage(
             run,
@@ -274,7 +285,7 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
             rival=posed.rival,
             number=number,
         )
-        if parts.result.num_registered == adjusted.num_registered:
+        if parts.result.num_registered == posed.adjustment.result.num_registered:
             break
         frame_of = image_set.images.frame_of
         frames = [frame_of[first] for first, _ in seams]
@@ -287,6 +298,15 @@ def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
         if posed.long_range is not None:
             posed = replace(posed, long_range=_long_range_check(run, posed, image_set))
     return posed
+
+
+def _seams_to_split(posed: Posed) -> list[tuple[str, str]]:
+    """Names of the images before and after each seam to split the model at."""
+    if posed.adjustment is None:
+        return []
+    adjusted = posed.adjustment.result
+    seams = adjusted.doubtful_seams if _are_apart(posed) else adjusted.few_point_seams
+    return sorted({*seams, *adjusted.scale_lost_seams})
 
 
 def _are_apart(posed: Posed) -> bool:
