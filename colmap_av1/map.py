@@ -23,7 +23,7 @@ from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
-from colmap_av1.matching.gaps import few_matches_warning
+from colmap_av1.matching.few_matches import few_matches_warning
 from colmap_av1.options import MapOptions, PlaceOptions
 from colmap_av1.poses.long_range import LongRangeErrors
 from colmap_av1.poses.mapper import map_poses

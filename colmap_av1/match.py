@@ -26,7 +26,8 @@ from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_prepared
 from colmap_av1.images.recognising import check_content
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
-from colmap_av1.matching.gaps import fast_frames, matching_warning
+from colmap_av1.matching.few_matches import matching_warning
+from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.initial_pairs import prepare_start
 from colmap_av1.matching.links.report import LinkReport
@@ -556,8 +557,7 @@ def _match_jointly(
         scratch,
         stages,
         ReconstructOptions(match=chosen),
-        context.clock,
-        context.progress,
+        context,
         cameras=cameras,
     )
     return match_jointly(

@@ -243,7 +243,7 @@ def reconstruct(
             for number, own in enumerate(sources)
         )
         shown = tuple(ShownVideo.as_played(own.pictures, own.kept) for own in sources)
-        run = Run(inputs, sources, shown, output, stages, options, clock, progress)
+        run = Run(inputs, sources, shown, output, stages, options, context)
         try:
             report = _run_stages(run)
         except ColmapAv1Error:  # A file that changed during the run may be the cause.
@@ -252,7 +252,7 @@ def reconstruct(
         if gaussians is not None:
             with clock.measure("gaussians"):
                 write_model_gaussians(Path(gaussians), output / "sparse" / "0")
-            report = replace(report, gaussians=Path(gaussians), seconds=clock.seconds)
+            report = replace(report, gaussians=Path(gaussians))
         _write_report(report)
     return report
 
@@ -332,7 +332,7 @@ def _run_stages(run: Run) -> ReconstructReport:
             *run.inputs.warnings,
             *positions.warnings,
             *run.inputs.with_names([stage.result.warnings for stage in tracked]),
-            *matches.link_warnings,
+            *matches.warnings,
             *placed.result.place_warnings,
             *([implausible] if implausible is not None else []),
             *_warnings(posed, model, len(image_set.sequence), further, not_registered),

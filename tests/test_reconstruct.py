@@ -373,7 +373,7 @@ def test_model_of_two_images_is_an_error(copy: Path, monkeypatch: pytest.MonkeyP
     def map_two(*_: object, **__: object) -> tuple[int, ...]:
         return (2,)
 
-    stages = importlib.import_module("colmap_av1.poses.pose_stages")
+    stages = importlib.import_module("colmap_av1.poses.mapping_stage")
     monkeypatch.setattr(stages, "map_poses", map_two)
     other = replace(OPTIONS, mapping=replace(OPTIONS.mapping, mapper="incremental"))
     with pytest.raises(ModelError, match="--mapper"):
@@ -435,7 +435,7 @@ def test_failed_long_range_check_adds_loop_closures(
     """Without links, a warning suggests them instead."""
     monkeypatch.setattr("colmap_av1.poses.long_range._MAX_ERROR", 0.0)
     options = replace(OPTIONS, match=replace(OPTIONS.match, links=LinkOptions(links)))
-    for name in ("long_range", "seams"):
+    for name in ("long_range", "first_estimate"):
         (copy / ".stages" / f"{name}.json").unlink()
     found = reconstruct(SCENE, copy, options=options)
     assert found.links.looked_again == (links == "auto")
@@ -465,7 +465,7 @@ def test_warning_names_images_that_are_not_registered(
     copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Images with fewer than 95 % of the median number of points are removed from the model.
-    monkeypatch.setattr("colmap_av1.poses.mapper.FEW_SEEN", (10_000, 0.95))
+    monkeypatch.setattr("colmap_av1.poses.adjusting._FEW_SEEN", (10_000, 0.95))
     (copy / ".stages" / "adjustment.json").unlink()
     found = reconstruct(SCENE, copy, options=OPTIONS)
     written = {path.name for path in (copy / "images").iterdir()}

@@ -394,7 +394,7 @@ def test_unconnected_videos_become_models_in_separate_folders(
         shutil.copytree(output / "0", output / "1")
         return size, size
 
-    monkeypatch.setattr("colmap_av1.poses.pose_stages.map_poses", map_twice)
+    monkeypatch.setattr("colmap_av1.poses.mapping_stage.map_poses", map_twice)
     alone = reconstruct(halves[0], tmp_path / "out", options=ReconstructOptions(match=QUICK))
     assert alone.other_models == ()
     assert alone.warnings == ()

@@ -17,7 +17,7 @@ from colmap_av1.database.reading import (
     matches_from_row,
 )
 from colmap_av1.errors import DatabaseError
-from colmap_av1.geometry.colmap_model import ModelImage
+from colmap_av1.geometry.colmap_model import ModelImage, posed_images
 from colmap_av1.matching.mapper_limits import MIN_INLIERS
 from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.poses.seams import images_in_time
@@ -89,7 +89,7 @@ def model_crossings(reconstruction: pycolmap.Reconstruction, database: Path) -> 
     Raises:
         DatabaseError: the database cannot be read, or is damaged.
     """
-    images, gaps = images_in_time(reconstruction)
+    images, gaps = images_in_time([*posed_images(reconstruction).values()])
     matches, fitting = (np.zeros(len(images) + 1, np.int64) for _ in range(2))
     for i, j, fits in _fitting(images, reconstruction.cameras, database):
         for change, count in ((matches, len(fits)), (fitting, int(np.count_nonzero(fits)))):

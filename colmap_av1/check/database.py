@@ -33,7 +33,8 @@ from colmap_av1.database.reading import cameras_of
 from colmap_av1.errors import DatabaseError
 from colmap_av1.images.names import videos_of
 from colmap_av1.matching.depth import DepthEvidence
-from colmap_av1.matching.gaps import Gap, few_match_gaps
+from colmap_av1.matching.few_matches import few_match_gaps
+from colmap_av1.matching.gaps import Gap
 from colmap_av1.matching.two_view_geometry import config_name
 from colmap_av1.util.graphs import connected_components
 

@@ -15,7 +15,8 @@ from colmap_av1.database.layout import columns
 from colmap_av1.errors import ImageError
 from colmap_av1.geometry.cameras import camera_fault, focal_length_warning
 from colmap_av1.matching.depth import DepthEvidence
-from colmap_av1.matching.gaps import Gap, few_matches_warning
+from colmap_av1.matching.few_matches import few_matches_warning
+from colmap_av1.matching.gaps import Gap
 from colmap_av1.matching.mapper_limits import (
     FORWARD_MOTION,
     INITIAL_MIN_ANGLE,

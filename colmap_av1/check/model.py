@@ -13,6 +13,7 @@ from colmap_av1.check.crossings import Crossings, model_crossings
 from colmap_av1.check.model_figures import ModelFigures, model_figures
 from colmap_av1.database.file import open_unaltered
 from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.geometry.posed_model import posed_model
 from colmap_av1.poses.long_range import LongRangeErrors, model_long_range_errors
 from colmap_av1.poses.seams import Seams, model_seams
 from colmap_av1.util.progress import Progress, no_progress
@@ -85,7 +86,7 @@ def check_model(
             mapped = [name for (name,) in connection.execute("SELECT name FROM images")]
     return ModelCheck(
         figures=model_figures(model),
-        seams=model_seams(model, all_images=mapped),
+        seams=model_seams(posed_model(model, with_points=True), all_images=mapped),
         crossings=None if database is None else model_crossings(model, Path(database)),
         long_range=long_range,
     )

@@ -6,7 +6,6 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -26,8 +25,15 @@ from colmap_av1.matching.mapper_limits import (
     SMALL_ANGLES,
     InitialLimits,
 )
-from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewGeometry
-from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
+from colmap_av1.matching.pair_poses import (
+    contradicted_angle,
+    is_wrong_rotation,
+    pair_pose,
+    rotations_of_homography,
+    some_inliers,
+    triangulation_angle,
+    wrong_angle,
+)
 from colmap_av1.util.progress import Clock
 from colmap_av1.util.spread import evenly_spread
 
@@ -51,22 +57,7 @@ _NUM_GROWN = 16
 _NUM_THREADS = 16
 # Neighbours are at most this many images apart. They connect the images, and are only demoted if
 # their pose is wrong, or if the mapper begins badly with them.
-NEIGHBOURS = 2
-# About this many inliers decide as well as all of them.
-_NUM_SOME = 64
-# A rotation is wrong if it differs from a known one by more than this share of the triangulation
-# angle.
-_WRONG = 0.25
-# A homography allows a pose if this share of the points is in front of both cameras.
-_FRONT_SHARE = 0.95
-# The pose of the homography is wrong if its triangulation angle and its error both exceed those of
-# the essential matrix by these factors. If the parallax of nearby images is below the mapper's
-# noise limit of 4 px, the angle is two to ten times as large and the error of most matches two to
-# twenty times. If the pose is right, the angles differ by less than a third.
-_ANGLE_FACTOR = 1.5
-_ERROR_FACTOR = 1.5
-# The error of a pose is this quantile of its matches' errors.
-_ERROR_QUANTILE = 0.9
+_NEIGHBOURS = 2
 
 
 @dataclass(frozen=True)
@@ -228,21 +219,21 @@ class _Candidates:
         poses: list[_Floats | None] = [None] * len(count)
         for k in np.flatnonzero(count >= _MIN_INLIERS).tolist():
             pair, geometry = matched.pairs[k].tolist(), matched.geometries[k]
-            some = _some_inliers(matched, cameras, pair, geometry)
-            pose = _pose(geometry, some)
+            some = some_inliers(matched, cameras, pair, geometry)
+            pose = pair_pose(geometry, some)
             if pose is None:
                 continue
-            angle[k], along[k] = _triangulation_angle(pose[:, :3], some.rays), abs(pose[2, 3])
+            angle[k], along[k] = triangulation_angle(pose[:, :3], some.rays), abs(pose[2, 3])
             known_pose = _known_pose(known, pair)
             poses[k] = known_pose
             if known_pose is not None:
                 known_along[k] = abs(known_pose[2, 3])
-            wrong_angle = _contradicted_angle(geometry, some)
-            if wrong_angle is None and known_pose is not None:
-                rotations = [pose[:, :3], *_rotations_of_homography(geometry, some)]
-                wrong_angle = _wrong_angle(rotations, known_pose[:, :3], some.rays)
-            if wrong_angle is not None:
-                is_wrong[k], angle[k] = True, wrong_angle
+            wrong = contradicted_angle(geometry, some)
+            if wrong is None and known_pose is not None:
+                rotations = [pose[:, :3], *rotations_of_homography(geometry, some)]
+                wrong = wrong_angle(rotations, known_pose[:, :3], some.rays)
+            if wrong is not None:
+                is_wrong[k], angle[k] = True, wrong
         is_sound = ~is_wrong & ~np.isnan(known_along if known else angle)
         is_far = are_far(matched.pairs)
         return _Candidates(count, angle, along, known_along, is_wrong, is_sound, is_far, poses)
@@ -437,13 +428,13 @@ class _Search:
             return None
         if begun.diverged:
             return False
-        turned = _angle_between(begun.cam2_from_cam1[:, :3], pose[:, :3])
-        return bool(turned <= _WRONG * max(limits.init_min_tri_angle, self._found.angle[k]))
+        angle = max(limits.init_min_tri_angle, float(self._found.angle[k]))
+        return not is_wrong_rotation(begun.cam2_from_cam1[:, :3], pose[:, :3], angle)
 
 
 def are_far(pairs: NDArray[np.int32]) -> NDArray[np.bool_]:
     """Whether the images of each pair, int32 [num_pairs, 2], are no neighbours."""
-    return np.asarray(pairs[:, 1] - pairs[:, 0] > NEIGHBOURS)
+    return np.asarray(pairs[:, 1] - pairs[:, 0] > _NEIGHBOURS)
 
 
 def _known_pose(models: Sequence[Sequence[_Floats | None]], pair: Sequence[int]) -> _Floats | None:
@@ -458,131 +449,3 @@ def _known_pose(models: Sequence[Sequence[_Floats | None]], pair: Sequence[int])
             step = second[:, 3] - rotation @ first[:, 3]
             return np.column_stack([rotation, step / max(float(np.linalg.norm(step)), 1e-12)])
     return None
-
-
-@dataclass(frozen=True)
-class _PairInliers:
-    """Inliers of a pair.
-
-    Attributes:
-        cameras: the cameras of the first and the second image.
-        x: float64 [2, n] of each image, normalised undistorted coordinates.
-    """
-
-    cameras: tuple[pycolmap.Camera, pycolmap.Camera]
-    x: tuple[_Floats, _Floats]
-
-    @property
-    def rays(self) -> list[_Floats]:
-        """Unit vectors to the inliers, float64 [3, n] of each image."""
-        rays = [np.vstack([own, np.ones(own.shape[1])]) for own in self.x]
-        return [own / np.linalg.norm(own, axis=0) for own in rays]
-
-
-def _some_inliers(
-    matched: MatchedImages,
-    cameras: Sequence[pycolmap.Camera],
-    pair: Sequence[int],
-    geometry: TwoViewGeometry,
-) -> _PairInliers:
-    """Some of the inliers of a pair, with a ray in front of both cameras."""
-    step = max(1, len(geometry.inlier_matches) // _NUM_SOME)
-    a, b = (
-        np.asarray(cameras[image].cam_from_img(matched.keypoints[image].xy[chosen].astype(float)))
-        for image, chosen in zip(pair, geometry.inlier_matches[::step].T, strict=True)
-    )
-    # Some pixels of a wide lens have no such ray.
-    is_known = np.isfinite(a + b).all(axis=1)
-    return _PairInliers((cameras[pair[0]], cameras[pair[1]]), (a[is_known].T, b[is_known].T))
-
-
-def _pose(geometry: TwoViewGeometry, inliers: _PairInliers) -> _Floats | None:
-    """The pose of a pair from its two-view geometry, float64 [3, 4]; None if it has no matrix."""
-    if geometry.qvec is not None and geometry.tvec is not None:
-        rotation = pycolmap.Rotation3d(np.roll(geometry.qvec, -1)).matrix()
-        return np.column_stack([rotation, geometry.tvec])
-    if geometry.config in FLAT_CONFIGS and geometry.H is not None:
-        return _pose_of_homography(geometry.H, inliers)
-    E = geometry.E
-    if E is None and geometry.F is not None:
-        a, b = (camera.calibration_matrix() for camera in inliers.cameras)
-        E = b.T @ geometry.F @ a
-    return None if E is None else _pose_of_essential(E, inliers)
-
-
-def _pose_of_homography(H: _Floats, inliers: _PairInliers) -> _Floats:
-    """Decompose a homography into a pose as COLMAP's mapper does, float64 [3, 4]."""
-    matrices = [camera.calibration_matrix() for camera in inliers.cameras]
-    found = pycolmap.pose_from_homography_matrix(H, *matrices, *(own.T for own in inliers.rays))
-    return np.asarray(found["cam2_from_cam1"].matrix())
-
-
-def _rotations_of_homography(geometry: TwoViewGeometry, inliers: _PairInliers) -> list[_Floats]:
-    """The rotations, float64 [3, 3], that the homography of a flat pair allows.
-
-    With two of them, nearly all points are in front of both cameras: the mapper may choose either.
-    """
-    if geometry.config not in FLAT_CONFIGS or geometry.H is None:
-        return []
-    a, b = (camera.calibration_matrix() for camera in inliers.cameras)
-    H = np.linalg.inv(b) @ geometry.H @ a
-    _, rotations, _, normals = cv2.decomposeHomographyMat(H, np.eye(3))
-    # Each rotation comes twice, with opposite normals.
-    return [
-        np.asarray(rotation)
-        for rotation, normal in zip(rotations, normals, strict=True)
-        if np.mean(normal.ravel() @ inliers.rays[0] > 0.0) >= _FRONT_SHARE
-    ]
-
-
-def _wrong_angle(
-    rotations: Sequence[_Floats], known: _Floats, rays: Sequence[_Floats]
-) -> float | None:
-    """Largest triangulation angle in degrees of rotations that contradict the known one."""
-    angles = [(_triangulation_angle(rotation, rays), rotation) for rotation in rotations]
-    return max(
-        (angle for angle, own in angles if _angle_between(own, known) > _WRONG * angle),
-        default=None,
-    )
-
-
-def _pose_of_essential(E: _Floats, inliers: _PairInliers) -> _Floats:
-    """Decompose an essential matrix into the pose with the most points in front of both cameras.
-
-    Returns float64 [3, 4].
-    """
-    a, b = (np.ascontiguousarray(own.T) for own in inliers.x)
-    _, rotation, translation, _ = cv2.recoverPose(E, a, b, np.eye(3))
-    return np.column_stack([rotation, translation])
-
-
-def _triangulation_angle(rotation: _Floats, rays: Sequence[_Floats]) -> float:
-    """Median triangulation angle of matches in degrees, given the rotation to the second camera."""
-    cosine = ((rotation @ rays[0]) * rays[1]).sum(axis=0)
-    return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
-
-
-def _angle_between(rotation: _Floats, other: _Floats) -> float:
-    """The angle between two rotations in degrees."""
-    cosine = (np.trace(rotation @ other.T) - 1.0) / 2.0
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-
-
-def _contradicted_angle(geometry: TwoViewGeometry, inliers: _PairInliers) -> float | None:
-    """Triangulation angle of the homography's pose in degrees, if the matches contradict it."""
-    of_pair = geometry.E
-    if geometry.config not in FLAT_CONFIGS or of_pair is None or geometry.H is None:
-        return None
-    pose = _pose_of_homography(geometry.H, inliers)
-    angle = _triangulation_angle(pose[:, :3], inliers.rays)
-    rotation = _pose_of_essential(of_pair, inliers)[:, :3]
-    if angle < _ANGLE_FACTOR * _triangulation_angle(rotation, inliers.rays):
-        return None
-    of_pose = essential_of_poses(np.eye(3, 4), pose)
-    is_wrong = _error(of_pose, inliers.x) > _ERROR_FACTOR * _error(of_pair, inliers.x)
-    return angle if is_wrong else None
-
-
-def _error(E: _Floats, x: Sequence[_Floats]) -> float:
-    """A high quantile of the Sampson errors, in focal lengths."""
-    return float(np.quantile(sampson_error(E, x[0], x[1]), _ERROR_QUANTILE))

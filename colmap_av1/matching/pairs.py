@@ -142,10 +142,8 @@ def pair_matches(a: ImageKeypoints, b: ImageKeypoints) -> NDArray[np.uint32]:
     Returns:
         uint32 [n, 2] keypoint indices (in a, in b), ascending in both columns.
     """
-    if a.track.size == 0 or b.track.size == 0:
-        return np.empty((0, 2), dtype=np.uint32)
-    place = np.minimum(np.searchsorted(b.track, a.track), b.track.size - 1)
-    in_a = np.flatnonzero(b.track[place] == a.track)
+    place, is_shared = _places_in(b, a)
+    in_a = np.flatnonzero(is_shared)
     return np.column_stack([in_a, place[in_a]]).astype(np.uint32)
 
 
@@ -211,10 +209,22 @@ def schedule_pairs(
 
 
 def _count_shared(a: ImageKeypoints, b: ImageKeypoints) -> int:
-    if a.track.size == 0 or b.track.size == 0:
-        return 0
-    place = np.minimum(np.searchsorted(b.track, a.track), b.track.size - 1)
-    return int(np.count_nonzero(b.track[place] == a.track))
+    return int(np.count_nonzero(_places_in(b, a)[1]))
+
+
+def _places_in(
+    other: ImageKeypoints, own: ImageKeypoints
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Where another image observes the tracks of an image.
+
+    Returns:
+        int64 [n] keypoint of the other image for each of this one, and bool [n] whether it has one;
+        without it the index means nothing.
+    """
+    if other.track.size == 0:
+        return np.zeros(own.track.size, np.int64), np.zeros(own.track.size, np.bool_)
+    place = np.minimum(np.searchsorted(other.track, own.track), other.track.size - 1)
+    return place, other.track[place] == own.track
 
 
 def _longest_track_span(keypoints: Sequence[ImageKeypoints]) -> int:

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
-
-import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
-import pycolmap
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.corners.in_images import corners_in_images
-from colmap_av1.poses.dynamic.following import follow_behind, has_changing_masks
+from colmap_av1.poses.adjustment_stage import AdjustedResult, adjustment_stage
 from colmap_av1.poses.dynamic.stage import (
     DynamicResult,
     dynamic_stage,
@@ -25,19 +21,17 @@ from colmap_av1.poses.dynamic.stage import (
     without_dynamic_tracks,
 )
 from colmap_av1.poses.long_range_stage import LongRangeResult, long_range_stage
-from colmap_av1.poses.match_stage import MatchesResult, match_stage, read_links
-from colmap_av1.poses.parts import split_stage
-from colmap_av1.poses.pose_stages import (
-    AdjustedResult,
+from colmap_av1.poses.mapping_stage import (
     MappedResult,
-    adjustment_stage,
+    mapping_stage,
     num_nearest,
-    pose_stage,
-    resection_stage,
     with_model_first,
 )
+from colmap_av1.poses.match_stage import MatchesResult, match_stage, matches_key, read_links
+from colmap_av1.poses.parts import split_stage
 from colmap_av1.poses.posed_images import PosesResult
 from colmap_av1.poses.remapping import remap_stage
+from colmap_av1.poses.resection_stage import resection_stage
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.tracks.tracks import Tracks
@@ -49,7 +43,7 @@ _Decision = TypeVar("_Decision")
 _FIRST_SPLIT = 3
 # A second mapping of the first model must agree with this share of the observations.
 _LEAST_KEPT = 0.9
-# Poses without further links are used only if they have this share of the images of the others.
+# Poses without further links must have this share of the images of those with them.
 _LEAST_SHARE = 0.5
 
 
@@ -59,7 +53,7 @@ class Posed:
 
     Attributes:
         matches: the database of the key images, see `match_stage`; that of the first model.
-        mapped: the poses of the key images, see `pose_stage`; after a second mapping or a split,
+        mapped: the poses of the key images, see `mapping_stage`; after a second mapping or a split,
             those of all its images.
         resection: the poses of the images in between; None if all images are key images.
         dynamic: the dynamic objects; None if they were not looked for.
@@ -117,12 +111,12 @@ class _Mapped:
     Attributes:
         matched: the database of the key images.
         keyed: the key images.
-        mapped: the mapper's models.
+        models: the mapper's models.
     """
 
     matched: Kept[MatchesResult]
     keyed: ImageSet
-    mapped: Kept[MappedResult]
+    models: Kept[MappedResult]
 
 
 @dataclass(frozen=True)
@@ -137,8 +131,8 @@ class _FirstModel:
 
 
 @dataclass(frozen=True)
-class _ToMend:
-    """Where links are looked for again, because the first poses seem wrong.
+class _FurtherLinks:
+    """Where links are looked for after the first estimate.
 
     Attributes:
         doubted: frames after doubtful seams where no links were looked for.
@@ -151,20 +145,20 @@ class _ToMend:
 
 
 @dataclass(frozen=True)
-class _FirstPoses:
-    """What the first poses tell.
+class _FirstEstimate:
+    """What the estimate without further links shows.
 
     Attributes:
-        errors: where links are looked for again.
+        links: where links are looked for.
         may_be_right: whether pictures agree with the poses, or may agree after a split.
     """
 
-    errors: _ToMend
+    links: _FurtherLinks
     may_be_right: bool
 
 
 def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> Posed:
-    """Estimate poses, and if they are doubtful estimate them again with SIFT links.
+    """Estimate poses, and if they are doubtful estimate them again with further SIFT links.
 
     Links replace motion at doubtful seams. Loop closures are looked for if pictures far apart in
     time contradict the poses. A model that is still poorly connected is split, see `parts`. If
@@ -173,75 +167,75 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
     than the largest part, it becomes the first.
     """
     options = run.options
-    key = [
-        [own.digest for own in videos],
-        image_set.videos,
-        run.photo_digests,
-        options.match,
-        options.mapping,
-        options.moving,
-        pycolmap.__version__,
-    ]
+    key = [matches_key(run, videos, image_set), options.mapping, options.moving]
+    no_links = _FurtherLinks()
 
-    def run_with_links(found: _ToMend) -> Run:
-        return _with_all_links(run) if found.loops else run
+    def run_with(links: _FurtherLinks) -> Run:
+        return _with_all_links(run) if links.loops else run
 
     # The caches hold only the last result, because estimates are large. A resumed run whose
     # decisions are stored makes only the final estimate.
     @lru_cache(maxsize=1)
-    def map_key_images(found: _ToMend) -> _Mapped:
-        return _map_key_images(run_with_links(found), videos, image_set, doubted=found.doubted)
+    def map_key_images(links: _FurtherLinks) -> _Mapped:
+        return _map_key_images(run_with(links), videos, image_set, doubted=links.doubted)
 
     @lru_cache(maxsize=1)
-    def pose(found: _ToMend, first: str | None) -> Posed:
-        return _pose_images(run_with_links(found), videos, image_set, map_key_images(found), first)
+    def pose(links: _FurtherLinks, first: str | None) -> Posed:
+        return _pose_images(run_with(links), videos, image_set, map_key_images(links), first)
 
     @lru_cache(maxsize=1)
-    def split(found: _ToMend, first: str | None) -> Posed:
-        return split_at_seams(run_with_links(found), pose(found, first), image_set)
+    def split(links: _FurtherLinks, first: str | None) -> Posed:
+        return split_at_seams(run_with(links), pose(links, first), image_set)
 
-    def look_for_errors(_: Path) -> _FirstPoses:
-        once = pose(_ToMend(), None)
-        errors = _ToMend(
-            doubted=tuple(_unlinked_seams(run, image_set, once)),
-            loops=_are_unlinked_and_apart(run, once),
+    def look_for_errors(_: Path) -> _FirstEstimate:
+        posed = pose(no_links, None)
+        links = _FurtherLinks(
+            doubted=tuple(_unlinked_seams(run, image_set, posed)),
+            loops=_needs_loops(run, posed),
         )
-        return _FirstPoses(errors, not _are_apart(once) or bool(_seams_to_split(once)))
+        may_be_right = not _is_contradicted(posed) or bool(_seams_to_split(posed))
+        return _FirstEstimate(links, may_be_right)
 
-    def compare_poses(_: Path) -> _ToMend:
-        if errors == _ToMend() or not first_poses.may_be_right:
-            return errors
-        mended = split(errors, None)
-        if not _are_apart(mended):
-            return errors
-        size = mended.last.result.num_registered
-        once = split(_ToMend(), None)
-        is_large = once.last.result.num_registered >= _LEAST_SHARE * size
-        return _ToMend() if is_large and not _are_apart(once) else errors
+    def choose_links(_: Path) -> _FurtherLinks:
+        links = first_estimate.links
+        if links == no_links:
+            return no_links
+        try:
+            posed = split(links, None)
+        except ModelError:  # the poses without them can be used
+            return no_links
+        if not first_estimate.may_be_right or not _is_contradicted(posed):
+            return links
+        size = posed.last.result.num_registered
+        del posed
+        pose.cache_clear()
+        split.cache_clear()
+        plain = split(no_links, None)
+        is_large = plain.last.result.num_registered >= _LEAST_SHARE * size
+        return no_links if is_large and not _is_contradicted(plain) else links
 
-    def compare_models(_: Path) -> _FirstModel:
-        largest_part = split(found, None)
+    def choose_model(_: Path) -> _FirstModel:
+        largest_part = split(links, None)
         size = largest_part.last.result.num_registered
-        if largest_part is pose(found, None):  # it was not split
+        if largest_part is pose(links, None):  # it was not split
             return _FirstModel(None)
-        other = _larger_model(run, map_key_images(found), size, image_set)
+        other = _larger_model(run, map_key_images(links), size, image_set)
         if other is None:
             return _FirstModel(None)
         del largest_part
         pose.cache_clear()
         split.cache_clear()
         try:
-            posed = split(found, other)
+            posed = split(links, other)
         except ModelError:  # too few tracks agree with its poses
             return _FirstModel(None)
         is_larger = posed.last.result.num_registered > size
-        return _FirstModel(other if is_larger and not _are_apart(posed) else None)
+        return _FirstModel(other if is_larger and not _is_contradicted(posed) else None)
 
-    first_poses = _decided(run, "seams", key, _FirstPoses, look_for_errors)
-    errors = first_poses.errors
-    found = _decided(run, "mended", [key, first_poses], _ToMend, compare_poses)
-    first = _decided(run, "first_model", [key, found], _FirstModel, compare_models).file
-    return split(found, first)
+    first_estimate = _decided(run, "first_estimate", key, _FirstEstimate, look_for_errors)
+    links = _decided(run, "further_links", [key, first_estimate], _FurtherLinks, choose_links)
+    first = _decided(run, "first_model", [key, links], _FirstModel, choose_model).file
+    return split(links, first)
 
 
 def _decided(
@@ -252,12 +246,12 @@ def _decided(
     make: Callable[[Path], _Decision],
 ) -> _Decision:
     """The result of a stage without products."""
-    return run_stage(run.stages, name, key, kind, into=run.stages, products=[], make=make).result
+    return run_stage(run.stages, name, key, kind, products=[], make=make).result
 
 
 def _larger_model(run: Run, mapped: _Mapped, size: int, image_set: ImageSet) -> str | None:
     """The file of the mapper's second model; None if it has no more than `size` images."""
-    others = mapped.mapped.result.other_models  # sorted by size
+    others = mapped.models.result.other_models  # sorted by size
     if not others:
         return None
     second = read_posed_model(run.stages / others[0])
@@ -305,19 +299,19 @@ def _seams_to_split(posed: Posed) -> list[tuple[str, str]]:
     if posed.adjustment is None:
         return []
     adjusted = posed.adjustment.result
-    seams = adjusted.doubtful_seams if _are_apart(posed) else adjusted.few_point_seams
+    seams = adjusted.doubtful_seams if _is_contradicted(posed) else adjusted.few_point_seams
     return sorted({*seams, *adjusted.scale_lost_seams})
 
 
-def _are_apart(posed: Posed) -> bool:
+def _is_contradicted(posed: Posed) -> bool:
     """Whether pictures far apart in time contradict the poses."""
-    return posed.long_range is not None and posed.long_range.result.apart
+    return posed.long_range is not None and posed.long_range.result.contradicts_poses
 
 
-def _are_unlinked_and_apart(run: Run, posed: Posed) -> bool:
+def _needs_loops(run: Run, posed: Posed) -> bool:
     """Whether pictures far apart contradict the poses, and no loop closures were looked for."""
     looked = run.options.match.links.links != "auto" or posed.matches.result.links.looked_again
-    return _are_apart(posed) and not looked
+    return _is_contradicted(posed) and not looked
 
 
 def _with_all_links(run: Run) -> Run:
@@ -354,7 +348,7 @@ def _map_key_images(
     if not depth.is_observable:
         raise ModelError(f"{run.inputs.name}: {depth.warning}")
     keyed = image_set.some(matched.result.key_images)
-    return _Mapped(matched, keyed, pose_stage(run, matched, image_set, keyed))
+    return _Mapped(matched, keyed, mapping_stage(run, matched, image_set, keyed))
 
 
 def _pose_images(
@@ -373,7 +367,7 @@ def _pose_images(
         found: the mapper's models.
         first: file of the one to continue with; None for the largest.
     """
-    mapped = found.mapped
+    mapped = found.models
     if first is not None:
         mapped = with_model_first(run, mapped, found.keyed, first)
     # Without a read-out time the tracks were not corrected.
@@ -455,17 +449,15 @@ def _adjusted(
     run: Run, posed: Posed, image_set: ImageSet, poses: Kept[PosesResult], *, number: int = 1
 ) -> Kept[AdjustedResult]:
     """Adjust poses, see `adjustment_stage`."""
-    dynamic_masks, has_picture_positions = posed.dynamic_masks, posed.has_picture_positions
-    follows = has_picture_positions and (bool(dynamic_masks) or has_changing_masks(image_set))
     return adjustment_stage(
         run,
         posed.tracks,
         posed.links,
         image_set,
         poses,
+        dynamic_masks=posed.dynamic_masks,
         masked=posed.masks_digest,
-        follow=partial(follow_behind, run, dynamic_masks) if follows else None,
-        corners=partial(corners_in_images, run, dynamic_masks) if has_picture_positions else None,
+        has_picture_positions=posed.has_picture_positions,
         is_fast=bool(posed.matches.result.links.fast),
         number=number,
     )

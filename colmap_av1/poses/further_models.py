@@ -18,8 +18,8 @@ from colmap_av1.poses.estimate import (
     split_at_seams,
     trusted_tracks,
 )
+from colmap_av1.poses.mapping_stage import MappedResult
 from colmap_av1.poses.parts import FEWEST_IMAGES
-from colmap_av1.poses.pose_stages import MappedResult
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import LEAST_IMAGES
 from colmap_av1.tracks.tracks import Tracks
@@ -205,7 +205,6 @@ def _poses_of_model(
         "poses",
         [mapped.digest, first.last.digest, mapped.file],
         MappedResult,
-        into=own.stages,
         products=["mapped.npz"],
         make=make,
     )

@@ -31,6 +31,7 @@ from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.adjusting import focal_length_errors, refines_intrinsics
+from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.estimate import Posed, estimate_poses
 from colmap_av1.poses.further_models import further_poses
 from colmap_av1.poses.long_range_stage import LongRangeResult
@@ -40,7 +41,6 @@ from colmap_av1.poses.matched_observations import (
     limits_of_density,
     matched_observations,
 )
-from colmap_av1.poses.pose_stages import AdjustedResult
 from colmap_av1.poses.posed_images import PosedImages, posed_images_of, triangulate_in
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.starting_pair import StartingPair, starting_pair
@@ -181,7 +181,7 @@ def match_jointly(
         link_tracks=posed.links,
         track_lengths=paired.track_lengths,
         depth=matches.depth,
-        warnings=(*matches.link_warnings, *warnings),
+        warnings=(*matches.warnings, *warnings),
         estimate=JointEstimate(
             num_registered=tuple(len(model.placed.images) for model in models),
             long_range=far.median if far is not None else None,
@@ -467,7 +467,7 @@ def _warnings(
         image_set: all images.
     """
     warnings = []
-    if far is not None and far.apart and far.warning is not None:
+    if far is not None and far.contradicts_poses and far.warning is not None:
         warnings.append(far.warning)
     if len(models) > 1:
         parts = ", ".join(

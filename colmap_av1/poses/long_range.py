@@ -11,7 +11,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
-from colmap_av1.geometry.colmap_model import ModelImage, camera_centres, posed_images
+from colmap_av1.geometry.colmap_model import ModelImage, posed_images
+from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file, natural_order
@@ -87,7 +88,7 @@ class LongRangeErrors:
         return float(np.quantile(self.error, 0.9)) if len(self.error) else None
 
     @property
-    def are_apart(self) -> bool:
+    def contradicts_poses(self) -> bool:
         """Whether the images contradict the poses."""
         return self.largest is not None and self.largest > _MAX_ERROR
 
@@ -103,7 +104,7 @@ class LongRangeErrors:
                 f"show nothing in common, with {self.num_features} features per image where sharp "
                 "ones have hundreds: the images are blurred or lack texture, or the poses are wrong"
             )
-        if not self.are_apart or self.worst is None:
+        if not self.contradicts_poses or self.worst is None:
             return None
         first, second = self.worst
         return (
@@ -248,14 +249,14 @@ def _far_pairs(
     num_images = len(images)
     if num_images <= GAP:
         return np.empty((0, 2), np.int32), np.empty(0)
-    poses = np.array([image.cam_from_world for image in images])
     chosen = evenly_spread(num_images, _NUM_IMAGES)
+    views = {i: PosedCamera(cameras[i], images[i].cam_from_world) for i in chosen}
     found: list[tuple[int, int, float]] = []
     for i in chosen:
         points = points_of(i)
         points = points[:: max(1, len(points) // _NUM_POINTS)]
         for j in reversed(chosen):
-            angle = _viewing_angle(points, poses[[i, j]], cameras[j]) if j >= i + GAP else None
+            angle = _viewing_angle(points, views[i], views[j]) if j >= i + GAP else None
             if angle is not None:
                 found.append((i, j, angle))
                 break
@@ -270,7 +271,7 @@ def _far_pairs(
     )
 
 
-def _viewing_angle(points: _Floats, poses: _Floats, camera: pycolmap.Camera) -> float | None:
+def _viewing_angle(points: _Floats, first: PosedCamera, second: PosedCamera) -> float | None:
     """Median angle in degrees between the directions in which two images see the same points.
 
     Returns None if the second image does not see most of the points of the first, or if the angle
@@ -278,18 +279,13 @@ def _viewing_angle(points: _Floats, poses: _Floats, camera: pycolmap.Camera) -> 
 
     Args:
         points: float64 [n, 3] points that the first image observes.
-        poses: float64 [2, 3, 4] cam_from_world of both images.
-        camera: camera of the second image.
+        first: the first image.
+        second: the second image.
     """
-    local = points @ poses[1, :, :3].T + poses[1, :, 3]
-    local = local[local[:, 2] > 0]
-    if len(local) < _MIN_OVERLAP * len(points) or len(local) == 0:
+    inside, _, _ = second.project(points)
+    if len(inside) == 0 or len(inside) < _MIN_OVERLAP * len(points):
         return None
-    x, y = np.asarray(camera.img_from_cam(local)).T
-    inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    if np.count_nonzero(inside) < _MIN_OVERLAP * len(points):
-        return None
-    rays = [points - centre for centre in camera_centres(poses)]
+    rays = [points - view.centre for view in (first, second)]
     near, far = (np.linalg.norm(ray, axis=1) for ray in rays)
     cosine = np.median(np.sum(rays[0] * rays[1], axis=1) / np.maximum(near * far, 1e-12))
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))

@@ -1,4 +1,4 @@
-"""The stage of `reconstruct` that runs the long-range check."""
+"""The stage that runs the long-range check."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class LongRangeResult:
             None if no such images have enough matches.
         largest: its 90th percentile.
         warning: warning about it.
-        apart: whether the images contradict the poses.
+        contradicts_poses: whether the images contradict the poses.
     """
 
     median: float | None
     largest: float | None
     warning: str | None
-    apart: bool
+    contradicts_poses: bool
 
 
 def long_range_stage(
@@ -77,7 +77,7 @@ def long_range_stage(
             median=far.median,
             largest=far.largest,
             warning=far.warning(linked=linked),
-            apart=far.are_apart,
+            contradicts_poses=far.contradicts_poses,
         )
 
     return run_stage(
@@ -85,7 +85,6 @@ def long_range_stage(
         "long_range",
         [posed.digest, masked, linked],
         LongRangeResult,
-        into=run.stages,
         products=[],
         make=make,
     )

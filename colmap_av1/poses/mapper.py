@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import statistics
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import read_model
@@ -22,9 +21,6 @@ from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
 
-if TYPE_CHECKING:
-    import pycolmap
-
 # Convergence is slow with a robust loss: steps that lower the cost by less than 0.1 % still reduce
 # the long-range epipolar error.
 ADJUSTMENT_STEPS = 20
@@ -32,20 +28,6 @@ ADJUSTMENT_TOLERANCE = 1e-4
 # Function tolerance of the mapper's global bundle adjustment where another adjustment follows. The
 # poses are the same after it, in half the time.
 _MAPPER_TOLERANCE = 1e-4
-# Initial radius of Ceres' trust region in adjustments after the first, a hundred times its default.
-# Near the minimum, the default slows down changes that are poorly determined, as that of the scale
-# in a turn. Far from it, the default is needed.
-_LATE_TRUST_RADIUS = 1e6
-# An adjustment before the last may stop earlier: the next one reaches the same minimum.
-_FIRST_TOLERANCE = 1e-3
-# Largest number of images for which the reduced camera matrix is solved as a dense one: long tracks
-# fill it, and analysing its sparsity takes as long as solving it.
-_MAX_DENSE_IMAGES = 400
-# An image must observe this many points to stay registered, as COLMAP's mapper requires, or this
-# share of the median if that is less. An image filled by a pillar observed 8 where others observed
-# 300 or more, and its pose error was 300 times theirs.
-FEW_SEEN = (30, 0.1)
-
 # The module is loaded from its file, since importing the whole package takes twice as long as
 # pycolmap. The path must not contain '': files in the working folder would shadow libraries.
 _CHILD = """
@@ -88,8 +70,7 @@ def map_poses(
         ModelError: the mapper failed; the log holds the details.
     """
     output.mkdir(parents=True, exist_ok=True)
-    settings = _mapping_settings(database, output, options, image_path)
-    settings["tolerance"] = _MAPPER_TOLERANCE if ends_early else None
+    settings = _mapping_settings(database, output, options, image_path, ends_early=ends_early)
     progress("poses", 0, num_images)
     sizes: list[int] = []
     placed = 0
@@ -133,7 +114,12 @@ def run_mapper(
 
 
 def _mapping_settings(
-    database: Path, output: Path, options: MapOptions, image_path: Path | None
+    database: Path,
+    output: Path,
+    options: MapOptions,
+    image_path: Path | None,
+    *,
+    ends_early: bool = False,
 ) -> dict[str, Any]:
     initial_pair = FORWARD_MOTION.options if options.forward_motion else {}
     if options.init_min_tri_angle is not None:
@@ -148,7 +134,7 @@ def _mapping_settings(
         "initial_pair": initial_pair,
         "seed": options.seed,
         "num_threads": threads_or_cpus(options.num_threads),
-        "tolerance": None,
+        "tolerance": _MAPPER_TOLERANCE if ends_early else None,
     }
 
 
@@ -221,7 +207,6 @@ def adjust_model(
     Raises:
         ModelError: the adjustment failed; the log holds the details.
     """
-    tolerances = [_FIRST_TOLERANCE] * (len(loss_scales) - 1) + [tolerance]
     settings = {
         "task": "adjustment",
         "model": str(model),
@@ -230,31 +215,11 @@ def adjust_model(
         "seed": seed,
         "num_threads": num_threads,
         "max_num_iterations": max_steps,
-        "function_tolerances": tolerances,
-        "most_dense_images": _MAX_DENSE_IMAGES,
+        "tolerance": tolerance,
         "iterative": iterative,
-        "late_trust_radius": _LATE_TRUST_RADIUS,
     }
     _run_in_process(settings, None, log, failed="COLMAP's adjustment", hint="--adjust 0 skips it")
     _check_whole(model)
-
-
-def without_unseen_images(model: Path) -> pycolmap.Reconstruction:
-    """Read a model and deregister the images that observe too few points.
-
-    Args:
-        model: folder of a COLMAP model; it is overwritten if an image is deregistered.
-    """
-    found = read_model(model)
-    counts = {number: image.num_points3D for number, image in found.images.items()}
-    most, share = FEW_SEEN
-    few = min(most, share * statistics.median(counts.values()))
-    unseen = [number for number, count in counts.items() if count < few]
-    for number in unseen:
-        found.deregister_frame(found.images[number].frame_id)
-    if unseen:
-        found.write_binary(model)
-    return found
 
 
 def _check_whole(model: Path) -> None:

@@ -14,6 +14,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+# Initial radius of Ceres' trust region in adjustments after the first, a hundred times its default.
+# Near the minimum, the default slows down changes that are poorly determined, as that of the scale
+# in a turn. Far from it, the default is needed.
+_LATE_TRUST_RADIUS = 1e6
+# An adjustment before the last may stop earlier: the next one reaches the same minimum.
+_FIRST_TOLERANCE = 1e-3
+# Largest number of images for which the reduced camera matrix is solved as a dense one: long tracks
+# fill it, and analysing its sparsity takes as long as solving it.
+_MAX_DENSE_IMAGES = 400
+
 
 def run_child(settings: dict[str, Any]) -> None:
     """Map or adjust in this process, and print progress to standard output."""
@@ -58,6 +68,7 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
     database, output = Path(settings["database"]), Path(settings["model"])
     refine = settings["refine_intrinsics"]
     pycolmap.set_random_seed(settings["seed"])
+    # pycolmap writes each model as soon as it is finished, but the largest is to come first.
     each = output / "each"
     each.mkdir()
     if settings["mapper"] == "incremental":
@@ -149,18 +160,19 @@ def _adjust(settings: dict[str, Any]) -> None:
     options.refine_focal_length = settings["refine_intrinsics"]
     options.refine_extra_params = settings["refine_intrinsics"]
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.max_num_images_direct_dense_cpu_solver = settings["most_dense_images"]
+    options.ceres.max_num_images_direct_dense_cpu_solver = _MAX_DENSE_IMAGES
     if settings["iterative"]:  # the solver is iterative beyond both limits
         options.ceres.max_num_images_direct_dense_cpu_solver = 1
         options.ceres.max_num_images_direct_sparse_cpu_solver = 2
     solver = options.ceres.solver_options
     solver.num_threads = settings["num_threads"]
     solver.max_num_iterations = settings["max_num_iterations"]
-    scales, tolerances = settings["loss_scales"], settings["function_tolerances"]
-    for number, (scale, tolerance) in enumerate(zip(scales, tolerances, strict=True)):
-        if number > 0:
-            solver.initial_trust_region_radius = settings["late_trust_radius"]
+    scales = settings["loss_scales"]
+    for number, scale in enumerate(scales, start=1):
+        if number > 1:
+            solver.initial_trust_region_radius = _LATE_TRUST_RADIUS
         options.ceres.loss_function_scale = scale
-        solver.function_tolerance = tolerance
+        is_last = number == len(scales)
+        solver.function_tolerance = settings["tolerance"] if is_last else _FIRST_TOLERANCE
         pycolmap.bundle_adjustment(model, options)
     model.write_binary(settings["model"])

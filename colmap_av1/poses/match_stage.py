@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ class MatchesResult:
 
     Attributes:
         links: SIFT links across gaps and loop closures.
-        link_warnings: warnings about cameras and links.
+        warnings: warnings about cameras and links.
         key_images: indices of the key images.
         num_pose_tracks: number of tracks that the poses are estimated from.
         assumes_focal_length: whether the focal length of some video is assumed.
@@ -52,7 +53,7 @@ class MatchesResult:
     """
 
     links: LinkReport
-    link_warnings: tuple[str, ...]
+    warnings: tuple[str, ...]
     key_images: tuple[int, ...]
     num_pose_tracks: int
     assumes_focal_length: bool
@@ -78,6 +79,20 @@ def read_links(stages: Path) -> tuple[Tracks, NDArray[np.int32]]:
         return tracks_of(file), file["broken"]
 
 
+def matches_key(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> list[Any]:
+    """What the matches depend on, except `doubted`, for `run_stage`."""
+    match, mapping = run.options.match, run.options.mapping
+    return [
+        [own.digest for own in videos],
+        image_set.videos,
+        run.photo_digests,
+        (match.tracks, match.pairs, match.verify, match.camera, match.links),
+        (_pose_density(run), mapping.key_images),
+        match.run.seed,
+        run.positions.digest if run.positions is not None else None,
+    ]
+
+
 def match_stage(
     run: Run,
     videos: Sequence[VideoTracks],
@@ -92,13 +107,11 @@ def match_stage(
         image_set: the images.
         doubted: frames, counted through the videos, with unreliable motion.
     """
-    options, clock = run.options, run.clock
-    mapping = options.mapping
+    clock = run.clock
     videos = [
         own.doubted_at([f - first for f in doubted if 0 <= f - first < own.tracks.num_frames])
         for own, first in zip(videos, image_set.first_frame.tolist(), strict=False)
     ]
-    density = _pose_density(run)
 
     def make(partial: Path) -> MatchesResult:
         with clock.measure("pairs"):
@@ -120,7 +133,7 @@ def match_stage(
         num_keypoints = sum(len(k.xy) for k in matched.keypoints)
         return MatchesResult(
             links=found.links,
-            link_warnings=found.warnings,
+            warnings=found.warnings,
             key_images=tuple(index),
             num_pose_tracks=len(found.track_lengths),
             assumes_focal_length=not all(camera.has_prior_focal_length for camera in of_videos),
@@ -132,20 +145,10 @@ def match_stage(
             keypoints_per_image=num_keypoints / len(matched.keypoints),
         )
 
-    match = options.match
-    given = (density, mapping.key_images, match.pairs, match.verify, match.camera, match.links)
     return run_stage(
         run.stages,
         "matches",
-        [
-            [own.digest for own in videos],
-            image_set.videos,
-            run.photo_digests,
-            given,
-            options.match.run.seed,
-            list(doubted),
-            run.positions.digest if run.positions is not None else None,
-        ],
+        [matches_key(run, videos, image_set), list(doubted)],
         MatchesResult,
         into=run.output,
         products=["database.db", f"{run.stages.name}/{_LINKS}"],

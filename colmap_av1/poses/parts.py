@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.colmap_model import camera_centres, keep_observations
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.pose_stages import AdjustedResult, MappedResult
+from colmap_av1.poses.adjustment_stage import AdjustedResult
+from colmap_av1.poses.mapping_stage import MappedResult
 from colmap_av1.poses.posed_images import registered_by_video
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.seams import least_depth_angle, ray_angle
@@ -93,7 +94,6 @@ def split_stage(
         name,
         [mapped.digest, adjusted.digest, list(seams), rival.digest if rival is not None else None],
         MappedResult,
-        into=run.stages,
         products=[name],
         make=make,
     )

@@ -24,6 +24,9 @@ from colmap_av1.util.stages import Kept
 
 # For pose estimation even points of uncertain depth are useful, so their depth error is unlimited.
 FOR_POSES = TriangulateOptions(max_depth_error=None, points="survey")
+# Corners and links keep large errors, because these are errors of the poses: of a rolling shutter,
+# or where the model is bent.
+FROM_PICTURES = replace(FOR_POSES, max_reprojection_error=8.0)
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,7 @@ def triangulate_in(
         [image.cam_from_world for image in placed.images],
         pinholes,
         options=options,
-        num_threads=run.options.match.run.num_threads,
+        num_threads=run.context.num_threads,
         progress=progress,
         rays=rays,
     )

@@ -39,21 +39,18 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.image_matches import verify_images
 from colmap_av1.matching.pairs import covisible_pairs
 from colmap_av1.options import MapOptions
-from colmap_av1.poses.adjusting import (
-    LOSS_SCALES,
-    adjust_posed,
-    mean_cost,
-    refines_intrinsics,
-)
+from colmap_av1.poses.adjusting import adjust_posed, mean_cost, refines_intrinsics
+from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.mapper import map_poses
-from colmap_av1.poses.pose_stages import (
+from colmap_av1.poses.mapping_stage import MappedResult
+from colmap_av1.poses.posed_images import (
     FROM_PICTURES,
-    AdjustedResult,
-    MappedResult,
+    posed_images_of,
+    registered_by_video,
+    triangulate_in,
 )
-from colmap_av1.poses.posed_images import posed_images_of, registered_by_video, triangulate_in
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.start_tracks import START_TRACKS, keep_start_tracks
+from colmap_av1.poses.start_tracks import keep_start_tracks
 from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
@@ -158,18 +155,13 @@ def remap_stage(
             from_initial=from_initial,
         )
 
+    match, mapping = run.options.match, run.options.mapping
+    given = (match.pairs, match.verify, run.context.seed, mapping.mapper_threads)
     return run_stage(
         run.stages,
         name,
-        [
-            mapped.digest,
-            adjusted.digest,
-            START_TRACKS,
-            LOSS_SCALES,
-            run.options.match.verify,
-        ],
+        [mapped.digest, adjusted.digest, given],
         RemappedResult,
-        into=run.stages,
         products=[name],
         make=make,
     )
@@ -199,7 +191,7 @@ def _map_tracks(
                 MapOptions(
                     mapper="global",
                     refine_intrinsics=refines_intrinsics(options),
-                    seed=options.match.run.seed,
+                    seed=run.context.seed,
                     num_threads=options.mapping.mapper_threads,
                 ),
                 image_path=None,

@@ -28,9 +28,8 @@ class Run:
         output: the output folder.
         stages: its subfolder with the results that later runs resume from.
         options: options of all stages.
-        clock: measures the time of each stage.
-        progress: called in each stage.
-        positions: positions of the images; None before the images are chosen.
+        context: clock, progress, threads and seed of the run.
+        positions: positions of the images; None if they are not known, or have no use.
         cameras: cameras of all images in an existing database; None creates them.
     """
 
@@ -40,15 +39,19 @@ class Run:
     output: Path
     stages: Path
     options: ReconstructOptions
-    clock: Clock
-    progress: Progress
+    context: RunContext
     positions: ImagePositions | None = None
     cameras: ImageCameras | None = None
 
     @property
-    def context(self) -> RunContext:
-        """Clock, progress, threads and seed of the run."""
-        return RunContext.of(self.options.match.run, self.clock, self.progress)
+    def clock(self) -> Clock:
+        """Measures the time of each stage."""
+        return self.context.clock
+
+    @property
+    def progress(self) -> Progress:
+        """Called in each stage."""
+        return self.context.progress
 
     @property
     def files(self) -> tuple[FileState, ...]:

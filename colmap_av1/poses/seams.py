@@ -14,7 +14,8 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.colmap_model import ModelImage, camera_centres, posed_images
+from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
+from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.names import natural_key, natural_order, videos_of
 
 # Points with fewer views are ignored: two views do not constrain the scale between images.
@@ -167,24 +168,22 @@ class Seams:
 
 
 def model_seams(
-    reconstruction: pycolmap.Reconstruction,
+    model: PosedModel,
     photos: Collection[str] = (),
     all_images: Collection[str] = (),
 ) -> Seams:
     """Count the points at each seam of a model, see `Seams`.
 
     Args:
-        reconstruction: the model.
+        model: the model, with points.
         photos: names of photos, which have no neighbours in time.
         all_images: names of the images that were mapped. Those that the model lacks count in the
             distance between two images.
     """
-    images, seams = images_in_time(reconstruction)
+    images, seams = images_in_time(model.images)
     seams = [k for k in seams if images[k].name not in photos and images[k + 1].name not in photos]
-    views, point, xyz = _seen_points(reconstruction, images)
+    views, point, xyz = _seen_points(model, images)
     num_images, num_seams = len(images), max(len(images) - 1, 0)
-    order = np.lexsort((views, point))
-    views, point = views[order], point[order]
     is_seam = np.isin(np.arange(num_seams), seams)
     sequence = np.cumsum(np.append(True, ~is_seam)) if num_images else np.empty(0, np.int64)
     is_near = (np.diff(point) == 0) & (np.diff(views) <= _REACH)
@@ -202,7 +201,7 @@ def model_seams(
     # The first view of a visit with enough parallax to its first one, and the last view with enough
     # parallax to its last one.
     deep_from, deep_to = (np.full(len(begin), fill) for fill in (num_images, -1))
-    least_angle = least_depth_angle(reconstruction.cameras[image.camera_id] for image in images)
+    least_angle = least_depth_angle(model.cameras[image.camera_id] for image in images)
     centres = camera_centres(np.array([image.cam_from_world for image in images]).reshape(-1, 3, 4))
     from_first = ray_angle(centres[views], centres[begin[visit]], xyz[point]) >= least_angle
     from_last = ray_angle(centres[views], centres[end[visit]], xyz[point]) >= least_angle
@@ -234,17 +233,15 @@ def model_seams(
     )
 
 
-def images_in_time(reconstruction: pycolmap.Reconstruction) -> tuple[list[ModelImage], list[int]]:
+def images_in_time(images: Sequence[ModelImage]) -> tuple[list[ModelImage], list[int]]:
     """The registered images of a model, in the natural order of their names.
 
     Returns:
         The images, and indices of those whose next one is a neighbour in time, see `videos_of`.
     """
-    posed = posed_images(reconstruction)
-    names = list(posed)
-    images = [posed[names[k]] for k in natural_order(names)]
-    videos = videos_of([i.camera_id for i in images], [i.name for i in images])
-    return images, [k for k, (own, other) in enumerate(pairwise(videos)) if own == other]
+    ordered = [images[k] for k in natural_order([image.name for image in images])]
+    videos = videos_of([i.camera_id for i in ordered], [i.name for i in ordered])
+    return ordered, [k for k, (own, other) in enumerate(pairwise(videos)) if own == other]
 
 
 def _points_of_loose_stretches(
@@ -299,24 +296,27 @@ def _places_in_time(names: Sequence[str], all_images: Collection[str]) -> NDArra
 
 
 def _seen_points(
-    reconstruction: pycolmap.Reconstruction, images: Sequence[ModelImage]
+    model: PosedModel, images: Sequence[ModelImage]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """The observations of points with at least three views.
+    """The views of points with at least three of them, sorted by point and image.
+
+    Args:
+        model: the model, with points.
+        images: its images, in the order in which they are counted.
 
     Returns:
-        Index [m] of the image and index [m] of the point of each observation, and the positions
-        [n, 3] of the points.
+        Index [m] of the image and index [m] of the point of each view, and the positions [n, 3] of
+        the points.
     """
-    place = {image.image_id: k for k, image in enumerate(images)}
-    views, counts, xyz = list[int](), list[int](), list[NDArray[np.float64]]()
-    for point in reconstruction.points3D.values():
-        own = {place[e.image_id] for e in point.track.elements if e.image_id in place}
-        if len(own) >= _FEWEST_VIEWS:
-            views += own
-            counts.append(len(own))
-            xyz.append(point.xyz)
-    number = np.repeat(np.arange(len(counts)), counts)
-    return np.array(views, np.int64), number, np.array(xyz, np.float64).reshape(-1, 3)
+    index = {image.name: k for k, image in enumerate(images)}
+    image = np.array([index[image.name] for image in model.images], np.int64)
+    points = model.points
+    point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
+    # A point may have several observations in an image.
+    views = np.unique(np.column_stack([point, image[points.image]]), axis=0)
+    enough = np.bincount(views[:, 0], minlength=len(points.xyz)) >= _FEWEST_VIEWS
+    views = views[enough[views[:, 0]]]
+    return views[:, 1], (np.cumsum(enough) - 1)[views[:, 0]], points.xyz[enough]
 
 
 def least_depth_angle(cameras: Iterable[pycolmap.Camera]) -> float:

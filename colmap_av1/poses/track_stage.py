@@ -109,9 +109,13 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     )
     tracking = replace(options.tracking, tracks=chaining)
     name, shown = stage_of_video(run, video), source.pictures
+    is_long = not options.images.ways and count_frames(source) > run.options.max_images
 
     def make(partial: Path) -> TracksResult:
-        found, is_long = _track_and_choose(run, video, tracking, partial)
+        if is_long:
+            found = _track_long(run, video, tracking)
+        else:
+            found = _track_and_choose(run, video, tracking, partial)
         chosen, tracked = found.chosen, found.video
         tracks, read_out = correct_rolling_shutter(
             tracked.tracks,
@@ -139,15 +143,24 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     mapping = run.options.mapping
     choice = (run.options.max_images, mapping.pose_tracks_per_image, mapping.pose_spacing)
     shutter = shutter_settings(options.camera)
-    given = (options.images, choice, options.read, chaining, options.refine, shutter)
+    given = (options.images, choice, options.read, options.tracks, chaining, options.refine)
+    # The images of a long video include those that links need.
+    for_images = options.links if is_long else None
     listed = digest_if_there(options.images.frame_list)
     masked = run.inputs.masks.digest if run.inputs.masks is not None else None
     return run_stage(
         run.stages,
         name,
-        [[file_digest(file.path) for file in source.files], given, listed, masked],
+        [
+            [file_digest(file.path) for file in source.files],
+            given,
+            for_images,
+            shutter,
+            options.run.seed,
+            listed,
+            masked,
+        ],
         TracksResult,
-        into=run.stages,
         products=[f"{name}.npz"],
         make=make,
     )
@@ -155,15 +168,9 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
 
 def _track_and_choose(
     run: Run, video: int, options: TrackingOptions, folder: Path
-) -> tuple[TrackedImages, bool]:
-    """Chain the motion of a video into tracks, and choose its images.
-
-    Returns:
-        The tracks and images, and whether the video is long.
-    """
+) -> TrackedImages:
+    """Chain the motion of a video into tracks, and choose its images."""
     source, images = run.sources[video], run.options.match.images
-    if not images.ways and count_frames(source) > run.options.max_images:
-        return _track_long(run, video, options), True
 
     def choose(tracked: TrackedVideo) -> ChosenImages:
         return choose_from_video(
@@ -176,7 +183,7 @@ def _track_and_choose(
         )
 
     masks = run.inputs.masks_of_videos[video]
-    return track_images(source, options, choose, masks=masks, context=run.context), False
+    return track_images(source, options, choose, masks=masks, context=run.context)
 
 
 def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages:

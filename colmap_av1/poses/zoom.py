@@ -15,8 +15,14 @@ from dataclasses import replace
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors, robust_costs
-from colmap_av1.poses.adjusting import LOSS_SCALES, Adjusted, adjust_posed, refines_intrinsics
+from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
+from colmap_av1.poses.adjusting import (
+    LOSS_SCALES,
+    Adjusted,
+    adjust_posed,
+    mean_cost,
+    refines_intrinsics,
+)
 from colmap_av1.poses.run import Run
 
 # Number of images that share a trial camera; fewer determine its focal length less well.
@@ -72,12 +78,11 @@ def _zooming_cameras(run: Run, model: PosedModel) -> set[int]:
     trial = _with_copies(model, model.cameras, _GROUP, max(model.cameras))
     if trial.cameras.keys() == model.cameras.keys():
         return set()
-    scale = LOSS_SCALES[-1]
     trial = adjust_posed(
         run,
         trial,
         log=_LOG,
-        loss_scales=[scale],
+        loss_scales=LOSS_SCALES[-1:],
         max_steps=_MAX_STEPS,
         tolerance=_TRIAL_TOLERANCE,
     ).model
@@ -87,20 +92,20 @@ def _zooming_cameras(run: Run, model: PosedModel) -> set[int]:
     for number in np.unique(camera_of_image).tolist():
         is_own = camera_of_image == number
         own = focal[is_own]
-        before, after = (_mean_cost(m, is_own, scale) for m in (model, trial))
+        before, after = (_mean_cost(m, is_own) for m in (model, trial))
         gain = 1 - after / before
         if own.max() > _MIN_RANGE * own.min() and gain > _MIN_GAIN:
             zooming.add(number)
     return zooming
 
 
-def _mean_cost(model: PosedModel, is_own: NDArray[np.bool_], loss_scale: float) -> float:
+def _mean_cost(model: PosedModel, is_own: NDArray[np.bool_]) -> float:
     """Mean cost of the observations in some images.
 
     Points behind the camera do not count: COLMAP drops them during the adjustment.
     """
     errors = reprojection_errors(model)[is_own[model.points.image]]
-    return float(robust_costs(errors[np.isfinite(errors)], loss_scale).mean())
+    return mean_cost(errors[np.isfinite(errors)])
 
 
 def _with_copies(

@@ -144,7 +144,7 @@ def _written_images(
                 folder,
                 [names[i] for i in own],
                 (placed.frames[own] - first).tolist(),
-                num_threads=options.match.run.num_threads,
+                num_threads=run.context.num_threads,
                 operating_point=options.match.read.operating_point,
                 change=functools.partial(change, first),
                 look=functools.partial(look_at, first),
@@ -185,7 +185,7 @@ def _written_cloud(
         placed.sequence,
         show,
         max_points=options.max_points,
-        num_threads=run.options.match.run.num_threads,
+        num_threads=run.context.num_threads,
         clock=clock,
     )
 

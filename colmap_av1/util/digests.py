@@ -19,6 +19,8 @@ PACKAGE = Path(__file__).resolve().parents[1]
 # them, because they change the last digits of the result.
 WITHOUT_EFFECT = frozenset({"ReadOptions.num_threads", "RunOptions.num_threads"})
 _CODE = {".py", ".so", ".pyd"}
+# Packages whose estimates are part of a result.
+_LIBRARIES = ("opencv-python-headless", "poselib", "pycolmap")
 # A file that is written again within this time may keep its time stamps: FAT stores them in steps
 # of 2 s.
 _UNSURE_NS = 2_000_000_000
@@ -124,10 +126,20 @@ def code_digest(*folders: str) -> str:
 
 def package_version() -> str:
     """Version of the installed package."""
+    return _version("colmap-av1") or "of a checkout"
+
+
+@functools.cache
+def library_versions() -> tuple[str | None, ...]:
+    """Versions of the libraries whose estimates are part of a result; None: not known."""
+    return tuple(_version(name) for name in _LIBRARIES)
+
+
+def _version(package: str) -> str | None:
     try:
-        return version("colmap-av1")
+        return version(package)
     except PackageNotFoundError:
-        return "of a checkout"
+        return None
 
 
 def digest_of(values: Iterable[Any], *, timed: bool = False) -> str:

@@ -28,6 +28,7 @@ from colmap_av1.util.digests import (
     digest_of,
     file_record,
     is_as_recorded,
+    library_versions,
     package_version,
 )
 from colmap_av1.util.files import only_run, remove_leftovers, whole_file
@@ -102,9 +103,9 @@ def run_stage(
     depends_on: Sequence[Any],
     kind: type[_Result],
     *,
-    into: Path,
     products: Sequence[str],
     make: Callable[[Path], _Result],
+    into: Path | None = None,
 ) -> Kept[_Result]:
     """Run a stage, unless an earlier run finished it with the same input.
 
@@ -114,17 +115,19 @@ def run_stage(
     Args:
         stages: the folder of the stages.
         name: name of the stage.
-        depends_on: everything except the code that the result depends on, see `digest_of`.
+        depends_on: everything that the result depends on, except the code of this package and
+            the versions of libraries, see `digest_of`.
         kind: dataclass of the result; its fields have types that JSON can hold, or are such
             dataclasses.
-        into: folder for the products.
         products: files and folders that the stage writes.
         make: writes the products to the given folder and returns the result.
+        into: folder for the products; None: the folder of the stages.
 
     Raises:
         ModelError: a file cannot be written.
         OptionError: a user's file is in the way.
     """
+    into = into or stages
     key = _stage_key(depends_on)
     record = stages / f"{name}.json"
     finished = _finished(record, key, into, kind)
@@ -188,9 +191,9 @@ def run_stage_in(
 def _stage_key(
     depends_on: Sequence[Any], *, made_by: Sequence[str] = WHOLE_PACKAGE, timed: bool = False
 ) -> str:
-    code = [code_digest(*made_by)]
+    code: list[Any] = [code_digest(*made_by)]
     if tuple(made_by) == WHOLE_PACKAGE:
-        code.append(package_version())
+        code += [package_version(), library_versions()]
     return digest_of([code, *depends_on], timed=timed)
 
 

@@ -8,13 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from colmap_av1.matching.gaps import (
-    Gap,
-    few_match_gaps,
-    few_matches_warning,
-    low_inter_frames,
-    low_inter_gaps,
-)
+from colmap_av1.matching.few_matches import few_match_gaps, few_matches_warning
+from colmap_av1.matching.gaps import Gap, low_inter_frames, low_inter_gaps
 
 NUM_IMAGES = 30
 REACH = 6

@@ -33,6 +33,7 @@ from colmap_av1.poses.adjusting import (
     with_second_distortion,
 )
 from colmap_av1.reconstruct import ReconstructReport
+from colmap_av1.util.run_context import RunContext
 
 
 def points_seen_in(views: list[list[int]]) -> ModelPoints:
@@ -145,6 +146,7 @@ def test_second_distortion_parameter_is_added_if_the_lens_needs_it(
         options=ReconstructOptions(match=MatchOptions(camera=options)),
         cameras=None,
         stages=tmp_path,
+        context=RunContext(),
     )
     found = with_second_distortion(run, model)
     if is_better:
@@ -172,7 +174,7 @@ def test_adjustment_recovers_poses_from_half_of_the_observations(
     ]
     moved = replace(some, xyz=some.xyz + rng.normal(0, 0.01, some.xyz.shape))
     before = replace(model, images=images, points=moved)
-    run = SimpleNamespace(options=OPTIONS, stages=tmp_path)
+    run = SimpleNamespace(options=OPTIONS, stages=tmp_path, context=RunContext())
     adjusted = adjust_posed(run, before)
 
     def error(images: Sequence[ModelImage]) -> float:

@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
+import pytest
 from scipy.spatial.transform import Rotation
 
 from colmap_av1 import ReconstructOptions
@@ -20,11 +21,12 @@ from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import MapperOptions
+from colmap_av1.poses.adjustment_stage import adjustment_stage
 from colmap_av1.poses.corners.in_images import resect_from_corners
-from colmap_av1.poses.pose_stages import adjustment_stage
 from colmap_av1.poses.posed_images import PosedImages, PosesResult
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import Clock, no_progress
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import Kept
 
 NUM_IMAGES, NUM_POINTS, FOCAL = 9, 200, 500.0
@@ -65,7 +67,7 @@ def scene() -> tuple[PosedImages, Tracks]:
     return placed, tracks
 
 
-RUN = cast(Any, SimpleNamespace(options=ReconstructOptions()))
+RUN = cast(Any, SimpleNamespace(options=ReconstructOptions(), context=RunContext()))
 
 
 def test_wrong_pose_is_corrected_from_corners() -> None:
@@ -95,7 +97,9 @@ def test_poses_are_unchanged_without_corners() -> None:
     assert resect_from_corners(RUN, none, placed) is placed
 
 
-def test_links_join_images_across_a_gap_in_the_tracks(tmp_path: Path) -> None:
+def test_links_join_images_across_a_gap_in_the_tracks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     placed, seen = scene()
     joint = 4  # the image before it
     after = placed.frames > joint
@@ -117,7 +121,12 @@ def test_links_join_images_across_a_gap_in_the_tracks(tmp_path: Path) -> None:
     write_posed_model(tmp_path / "placed.npz", PosedModel(placed.cameras, images))
     options = ReconstructOptions(mapping=MapperOptions(refine_intrinsics=False))
     run = SimpleNamespace(
-        options=options, stages=tmp_path, clock=Clock(), progress=no_progress, positions=None
+        options=options,
+        stages=tmp_path,
+        context=RunContext(),
+        clock=Clock(),
+        progress=no_progress,
+        positions=None,
     )
     image_set = ImageSet(
         ("",),
@@ -126,15 +135,19 @@ def test_links_join_images_across_a_gap_in_the_tracks(tmp_path: Path) -> None:
         placed.first_frame,
         placed.masks,
     )
+    monkeypatch.setattr(
+        "colmap_av1.poses.adjustment_stage.corners_in_images",
+        lambda _run, _masks, _guide, known: (tracks, known),
+    )
     adjusted = adjustment_stage(
-        *(
-            cast(Any, run),
-            tracks,
-            links,
-            image_set,
-            Kept(PosesResult("placed.npz", NUM_IMAGES, {}), "", resumed=False),
-        ),
-        corners=lambda _, known: (tracks, known),
+        cast(Any, run),
+        tracks,
+        links,
+        image_set,
+        Kept(PosesResult("placed.npz", NUM_IMAGES, {}), "", resumed=False),
+        dynamic_masks={},
+        masked=None,
+        has_picture_positions=True,
     )
     found = read_posed_model(tmp_path / adjusted.result.poses).by_name
     centres = camera_centres(np.array([found[i.name].cam_from_world for i in placed.images]))

@@ -48,7 +48,6 @@ from colmap_av1.reconstruct import reconstruct
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import VideoSource, track_video
-from colmap_av1.util.progress import Clock, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.facts import read_video
@@ -337,8 +336,7 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
         folder,
         folder,
         ReconstructOptions(),
-        Clock(),
-        no_progress,
+        RunContext(),
     )
     some = DensityOptions(max_tracks_per_image=400, spacing=20.0, min_images=3, max_sigma=0.0)
     cut = mask_tracks(every.keep_frames(frames), dict(enumerate(masks)), 4)

@@ -167,7 +167,9 @@ def test_links_that_images_contradict_are_not_used(
     """Links at a doubtful seam replace motion unless images contradict only poses with them."""
     monkeypatch.setattr(estimate, "_unlinked_seams", lambda run, image_set, posed: [30])
     monkeypatch.setattr(
-        estimate, "_are_apart", lambda posed: is_wrong and bool(posed.matches.result.links.gaps)
+        estimate,
+        "_is_contradicted",
+        lambda posed: is_wrong and bool(posed.matches.result.links.gaps),
     )
     report = match(tmp_path / "a.db", scene, image_path=joint.image_path, options=OPTIONS)
     assert not joint.links.gaps

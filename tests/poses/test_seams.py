@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from colmap_av1.check.crossings import model_crossings
 from colmap_av1.cli import main
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, read_model, write_model
+from colmap_av1.geometry.posed_model import posed_model
 from colmap_av1.options import CameraOptions
 from colmap_av1.poses.seams import Seams, model_seams
 from colmap_av1.reconstruct import ReconstructReport
@@ -23,8 +25,14 @@ _LEFT = 5
 _SOUND = 0.95
 
 
+def seams_of(
+    model: pycolmap.Reconstruction, photos: Collection[str] = (), all_images: Collection[str] = ()
+) -> Seams:
+    return model_seams(posed_model(model, with_points=True), photos, all_images)
+
+
 def test_consistent_model_has_no_weak_seam(made: ReconstructReport) -> None:
-    seams = model_seams(read_model(made.output / "sparse" / "0"))
+    seams = seams_of(read_model(made.output / "sparse" / "0"))
     assert len(seams.pairs) == made.num_registered - 1
     assert seams.disconnected == []
     assert seams.warning is None
@@ -45,7 +53,7 @@ def test_seam_with_few_points_is_reported(
     for _, point_id in sorted(joining)[:-_LEFT]:
         model.delete_point3D(point_id)
 
-    seams = model_seams(model)
+    seams = seams_of(model)
     first, second = by_name[middle - 1].name, by_name[middle].name
     assert [seams.pairs[i] for i in seams.disconnected] == [(first, second)]
     assert seams.num_points[seams.disconnected].tolist() == [_LEFT]
@@ -61,7 +69,7 @@ def test_seam_with_few_points_is_reported(
 def test_loop_closures_do_not_count_at_seams_inside_the_loop(tmp_path: Path) -> None:
     """Thirty images in a row: 100 points join neighbours, 500 join the first and last images."""
     write_row(tmp_path, [[k, k + 1, k + 2] for k in range(28) for _ in range(100)], 500)
-    found = model_seams(read_model(tmp_path)).num_points
+    found = seams_of(read_model(tmp_path)).num_points
     assert found.tolist() == [600, *[200] * 27, 600]
 
 
@@ -74,8 +82,8 @@ def test_stretch_without_points_of_the_parts_around_it_is_not_connected(tmp_path
     for image in list(model.images.values()):
         if names.index(image.name) in {*range(5, 10), *range(15, 20)}:
             model.deregister_frame(image.frame_id)
-    assert model_seams(model).num_points[[4, 9]].tolist() == [503, 503]
-    found = model_seams(model, all_images=names)
+    assert seams_of(model).num_points[[4, 9]].tolist() == [503, 503]
+    found = seams_of(model, all_images=names)
     assert found.num_points[[4, 9]].tolist() == [3, 3]
     assert found.few_points == [4, 9]
 
@@ -83,15 +91,15 @@ def test_stretch_without_points_of_the_parts_around_it_is_not_connected(tmp_path
 def test_cut_is_no_weak_seam_if_a_loop_closure_joins_its_sides(tmp_path: Path) -> None:
     views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
     write_row(tmp_path, views, 20)
-    assert model_seams(read_model(tmp_path)).disconnected == [14]
+    assert seams_of(read_model(tmp_path)).disconnected == [14]
     write_row(tmp_path, views, 150)
-    assert model_seams(read_model(tmp_path)).disconnected == []
+    assert seams_of(read_model(tmp_path)).disconnected == []
 
 
 def test_seams_are_found_with_a_camera_per_image(tmp_path: Path) -> None:
     views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
     write_row(tmp_path, views, 0, num_cameras=30)
-    assert model_seams(read_model(tmp_path)).disconnected == [14]
+    assert seams_of(read_model(tmp_path)).disconnected == [14]
 
 
 def test_photos_are_no_neighbours_in_time(tmp_path: Path) -> None:
@@ -99,8 +107,8 @@ def test_photos_are_no_neighbours_in_time(tmp_path: Path) -> None:
     write_row(tmp_path, views, 0)
     model = read_model(tmp_path)
     names = sorted(image.name for image in model.images.values())
-    assert model_seams(model, names[15:]).disconnected == []
-    assert len(model_seams(model, names[15:]).num_points) == 14
+    assert seams_of(model, names[15:]).disconnected == []
+    assert len(seams_of(model, names[15:]).num_points) == 14
 
 
 def write_row(folder: Path, views: list[list[int]], again: int, *, num_cameras: int = 1) -> None:
@@ -224,14 +232,14 @@ def test_turn_keeps_the_scale_if_points_are_seen_across_it(
     tmp_path: Path, degrees: float, aside: float, rest: int
 ) -> None:
     _walk_with_a_turn(tmp_path, degrees, aside, rest)
-    seams = model_seams(read_model(tmp_path))
+    seams = seams_of(read_model(tmp_path))
     assert seams.scale_lost == []
     assert seams.warning is None
 
 
 def test_turn_wider_than_the_field_of_view_loses_the_scale(tmp_path: Path) -> None:
     turn = _walk_with_a_turn(tmp_path, degrees=80)
-    seams = model_seams(read_model(tmp_path))
+    seams = seams_of(read_model(tmp_path))
     assert seams.disconnected == []
     lost = {seams.pairs[i] for i in seams.scale_lost}
     assert len(lost) > len(turn) / 2
@@ -249,7 +257,7 @@ def test_scale_is_not_lost_where_another_video_begins(tmp_path: Path) -> None:
         image.name = f"a/{k:02}.png"
     for k, image in enumerate(images[:22]):
         image.name = f"b/{k:02}.png"
-    seams = model_seams(model)
+    seams = seams_of(model)
     assert ("b/00.png", "b/01.png") in seams.pairs
     assert seams.scale_lost == []
     assert seams.warning is None
@@ -272,6 +280,6 @@ def test_enough_points_carry_the_scale_even_if_others_have_more(
 
 def test_loop_closure_carries_no_scale_across_a_turn_inside_the_loop(tmp_path: Path) -> None:
     turn = _walk_with_a_turn(tmp_path, degrees=80, back=True)
-    seams = model_seams(read_model(tmp_path))
+    seams = seams_of(read_model(tmp_path))
     lost = {seams.pairs[i] for i in seams.scale_lost} & set(pairwise(turn))
     assert len(lost) > len(turn) / 2

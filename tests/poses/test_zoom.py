@@ -29,6 +29,7 @@ from colmap_av1.options import (
 )
 from colmap_av1.poses.zoom import with_own_cameras
 from colmap_av1.reconstruct import reconstruct
+from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.decoding import decode_frames
 
 ZOOM = 1.2
@@ -111,7 +112,7 @@ def test_point_behind_a_camera_is_not_taken_for_a_zoom(truth: Truth, tmp_path: P
     xyz = model.points.xyz.copy()
     xyz[0] = first.cam_from_world[:, :3].T @ ([0.0, 0.0, -1.0] - first.cam_from_world[:, 3])
     behind = replace(model, points=replace(model.points, xyz=xyz))
-    run = SimpleNamespace(options=OPTIONS, stages=tmp_path)
+    run = SimpleNamespace(options=OPTIONS, stages=tmp_path, context=RunContext())
     found = with_own_cameras(run, behind)
     assert found.model.cameras.keys() == model.cameras.keys()
 

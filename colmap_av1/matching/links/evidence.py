@@ -111,7 +111,7 @@ def gaps_after_linking(
     sequence = image_set.sequence[merged.pairs]
     found = []
     for gap in gaps.tolist():
-        reasons: list[GapReason] = ["low inter share"]
+        reasons: list[GapReason] = ["doubtful motion"]
         crossing = (merged.pairs[:, 0] <= gap) & (merged.pairs[:, 1] > gap)
         crossing &= sequence[:, 0] == sequence[:, 1]
         inliers = [len(merged.geometries[k].inlier_matches) for k in np.flatnonzero(crossing)]

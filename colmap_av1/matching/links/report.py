@@ -45,7 +45,7 @@ class LinkReport:
     unlinked_photos: tuple[str, ...] = ()
     same_videos: tuple[tuple[str, str], ...] = ()
 
-    def frames_of_gaps(self, reason: GapReason = "low inter share") -> list[tuple[int, int]]:
+    def frames_of_gaps(self, reason: GapReason = "doubtful motion") -> list[tuple[int, int]]:
         """Frames on either side of each gap with a reason; every gap has the default reason."""
         return [gap.frames for gap in self.gaps if gap.frames and reason in gap.reasons]
 

@@ -15,8 +15,7 @@ from colmap_av1.geometry.resection import resect, sightings_of
 from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.patch_matching import match_patches
-from colmap_av1.poses.pose_stages import FROM_PICTURES
-from colmap_av1.poses.posed_images import PosedImages, triangulate_in
+from colmap_av1.poses.posed_images import FROM_PICTURES, PosedImages, triangulate_in
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.corners import CornerDensity, follow_corners
 from colmap_av1.tracks.tracks import Tracks
@@ -107,7 +106,7 @@ def _match_in_all(
         views=views,
         frames=placed.frames,
         pictures=pictures,
-        num_threads=run.options.match.run.num_threads,
+        num_threads=run.context.num_threads,
         progress=report,
     )
 

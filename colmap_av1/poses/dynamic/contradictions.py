@@ -336,8 +336,7 @@ class Contradictions:
         cell = (row.astype(np.int64) + edge) * stride + column + edge
         count = np.bincount(step * size + cell, minlength=size * _NUM_STEPS)
         steps = count.reshape(_NUM_STEPS, size)
-        for step_number in range(1, _NUM_STEPS):
-            steps[step_number] += steps[step_number - 1]
+        np.cumsum(steps, axis=0, out=steps)
         first = at[2] * size + at[0] * stride + at[1]
         around = [down * stride + across for down in range(_AROUND) for across in range(_AROUND)]
         return np.asarray(sum(count[first + shift] for shift in around), np.int64)

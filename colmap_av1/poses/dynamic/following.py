@@ -76,7 +76,7 @@ def follow_behind(
             [v.cam_from_world for v in views],
             None,
             options=FOR_POSES,
-            num_threads=run.options.match.run.num_threads,
+            num_threads=run.context.num_threads,
             progress=no_progress,
         )
         expected, is_expected = expect_in_views(seen, view, points, views, frames)

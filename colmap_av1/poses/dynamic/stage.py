@@ -1,4 +1,4 @@
-"""The stage of `reconstruct` that finds dynamic pixels."""
+"""The stage that finds dynamic pixels."""
 
 from __future__ import annotations
 
@@ -67,7 +67,6 @@ def dynamic_stage(
         "dynamic",
         [posed.digest],
         DynamicResult,
-        into=run.stages,
         products=[_FILE],
         make=make,
     )
@@ -118,7 +117,7 @@ def _dynamic_masks(
     run: Run, tracks: Tracks, placed: PosedImages, own: NDArray[np.intp]
 ) -> dict[str, Mask]:
     """Masks that exclude dynamic pixels from the images of a video, by image name."""
-    num_threads = run.options.match.run.num_threads
+    num_threads = run.context.num_threads
     images = [placed.images[i] for i in own]
     views = views_of(images, placed.cameras, [None] * len(own))
     size = views[0].size

@@ -51,7 +51,7 @@ def place_stage(
         posed: the stage with the poses.
         positions: GPS positions and gravity of the images of `image_set`.
     """
-    options, seed = run.options.place, run.options.match.run.seed
+    options, seed = run.options.place, run.context.seed
     undistort = run.options.undistort
     file = f"{run.stages.name}/in_place.npz"
 

@@ -1,0 +1,184 @@
+"""The stage that bundle-adjusts the poses of all images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from colmap_av1.geometry.cameras import has_long_focal_length
+from colmap_av1.geometry.colmap_model import ModelPoints, joined_points
+from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
+from colmap_av1.geometry.track_points import seen_in, to_model_points
+from colmap_av1.images.image_set import ImageSet
+from colmap_av1.options import DensityOptions, TriangulateOptions
+from colmap_av1.poses.adjusting import adjust_posed, refines_intrinsics, without_unseen_images
+from colmap_av1.poses.corners.in_images import corners_in_images
+from colmap_av1.poses.dynamic.following import follow_behind, has_changing_masks
+from colmap_av1.poses.posed_images import (
+    FOR_POSES,
+    FROM_PICTURES,
+    PosedImages,
+    PosesResult,
+    check_agreement,
+    read_posed_images,
+    registered_by_video,
+    triangulate_in,
+)
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.seams import model_seams
+from colmap_av1.poses.track_stage import pose_tracks
+from colmap_av1.poses.zoom import with_own_cameras
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.stages import Kept, run_stage
+
+# The selection of tracks for bundle adjustment.
+_ADJUSTED = DensityOptions(
+    preset="sparse", max_tracks_per_image=500, spacing=12.0, min_images=3, max_sigma=0.0
+)
+# If corners are used as well, every second motion track is kept, cut into pieces of eight images.
+# Motion tracks are less accurate than corners, their errors are correlated, and they drift: over
+# twenty images by three times as much as over three, which bends the model.
+_NTH_WITH_CORNERS = 2
+_LENGTH_WITH_CORNERS = 8
+# From this many images on, an iterative solver is faster if the scale is well determined: it takes
+# 10 instead of 20 CPU s for 300 images, with the same accuracy. In walks with fast turns it takes
+# three times as long as a direct one.
+_ITERATIVE_IMAGES = 200
+# Corners determine the pose of an image, so motion tracks with larger errors are rejected.
+_WITH_CORNERS = replace(FOR_POSES, max_reprojection_error=0.3)
+
+
+@dataclass(frozen=True)
+class AdjustedResult(PosesResult):
+    """Result of `adjustment_stage`.
+
+    Attributes:
+        num_motion_points: number of points of motion tracks. They come first; points of corners
+            and links follow.
+        doubtful_seams: names of the images before and after each of `Seams.doubtful`.
+        few_point_seams: names of the images before and after each of `Seams.few_points`.
+        scale_lost_seams: names of the images before and after each of `Seams.worst_scale_lost`.
+        usual_scaled: see `Seams.usual_scaled`.
+        seams_warning: see `Seams.disconnected_warning`.
+        has_long_focal_length: whether the focal length of a camera was refined, and is longer than
+            in most videos.
+    """
+
+    num_motion_points: int
+    doubtful_seams: tuple[tuple[str, str], ...]
+    few_point_seams: tuple[tuple[str, str], ...]
+    scale_lost_seams: tuple[tuple[str, str], ...]
+    usual_scaled: float
+    seams_warning: str | None
+    has_long_focal_length: bool
+
+
+def adjustment_stage(
+    run: Run,
+    tracks: Tracks,
+    links: Tracks,
+    image_set: ImageSet,
+    posed: Kept[PosesResult],
+    *,
+    dynamic_masks: Mapping[str, Mask],
+    masked: str | None,
+    has_picture_positions: bool,
+    is_fast: bool = False,
+    number: int = 1,
+) -> Kept[AdjustedResult]:
+    """Bundle-adjust the poses with a robust loss, on long tracks that cover the images evenly.
+
+    All links get points: without them places that are seen again would drift apart. Corners of the
+    pictures correct poses that motion misleads, as at a jerk of the camera. `adjust_posed` selects
+    observations of points that have many.
+
+    Args:
+        run: the run.
+        tracks: the tracks of all sequences.
+        links: links as tracks.
+        image_set: the images.
+        posed: the stage with the initial poses.
+        dynamic_masks: masks that exclude dynamic pixels, by image name; `tracks` and `links` have
+            none of these pixels.
+        masked: digest of the stage that found them; None if there are none.
+        has_picture_positions: whether tracks have positions in the pictures; else the pictures are
+            not used.
+        is_fast: the camera turns fast somewhere, so that the scale may be poorly determined.
+        number: number of the adjustment in the run, which names its files.
+    """
+    options = run.options
+    suffix = f"_{number}" if number > 1 else ""
+    refine = refines_intrinsics(options)
+    has_gaps = bool(dynamic_masks) or has_changing_masks(image_set)
+
+    def make(partial: Path) -> AdjustedResult:
+        placed = read_posed_images(run, posed, image_set)
+        # Not kept in a variable: the long tracks need several times the memory of the selection.
+        spread = select_tracks(pose_tracks(run, tracks).keep_frames(placed.frames), _ADJUSTED)
+        if has_picture_positions and has_gaps:
+            with run.clock.measure("refinement"):
+                spread = follow_behind(run, dynamic_masks, spread, placed)
+        linked = links.keep_frames(placed.frames)
+        sets = [(spread, FOR_POSES), (linked, FOR_POSES)]
+        if has_picture_positions:
+            with run.clock.measure("refinement"):
+                guide = Tracks.concatenate(spread, linked)
+                followed, placed = corners_in_images(run, dynamic_masks, guide, placed)
+            few = spread.every_nth(_NTH_WITH_CORNERS).split_to_length(_LENGTH_WITH_CORNERS)
+            sets = [(few, _WITH_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
+        with run.clock.measure("adjustment"):
+            points = [_black_points(run, placed, *own) for own in sets]
+            check_agreement(sum(len(own.xyz) for own in points), spread.num_tracks)
+            run.progress("adjustment", 0, 1)
+            model = PosedModel(placed.cameras, placed.images, joined_points(points))
+            iterative = len(model.images) >= _ITERATIVE_IMAGES and not is_fast
+            adjusted = adjust_posed(run, model, iterative=iterative)
+            run.progress("adjustment", 1, 1)
+            registered = without_unseen_images(adjusted.model)
+        names = image_set.images.names
+        photos = names[image_set.images_of(len(image_set.videos)).start :]
+        seams = model_seams(registered.model, photos, names)
+        with run.clock.measure("adjustment"):
+            own = with_own_cameras(run, registered.model)
+        kept = adjusted.kept_points[registered.kept_points][own.kept_points]
+        is_motion = kept < len(points[0].xyz)
+        result = own.model
+        write_posed_model(partial / f"adjusted{suffix}.npz", result)
+        return AdjustedResult(
+            poses=f"adjusted{suffix}.npz",
+            num_registered=len(result.images),
+            registered=registered_by_video(result.by_name, image_set),
+            num_motion_points=int(is_motion.sum()),
+            doubtful_seams=tuple(seams.pairs[i] for i in seams.doubtful),
+            few_point_seams=tuple(seams.pairs[i] for i in seams.few_points),
+            scale_lost_seams=tuple(seams.pairs[i] for i in seams.worst_scale_lost),
+            usual_scaled=seams.usual_scaled,
+            # No warning about a lost scale: the model is split there, see `parts`.
+            seams_warning=seams.disconnected_warning,
+            has_long_focal_length=refine
+            and any(map(has_long_focal_length, result.cameras.values())),
+        )
+
+    given = (refine, options.mapping.mapper_threads, run.context.seed)
+    return run_stage(
+        run.stages,
+        f"adjustment{suffix}",
+        [posed.digest, given, options.match.camera.single_camera, has_picture_positions, masked],
+        AdjustedResult,
+        products=[f"adjusted{suffix}.npz"],
+        make=make,
+    )
+
+
+def _black_points(
+    run: Run, placed: PosedImages, tracks: Tracks, options: TriangulateOptions
+) -> ModelPoints:
+    """Triangulated points of tracks in the registered images, all black."""
+    seen, view = seen_in(tracks, placed.frames)
+    points = triangulate_in(run, placed, seen, view, options=options)
+    return to_model_points(points, view, seen.xy[points.observation].astype(np.float64))

@@ -1,0 +1,217 @@
+"""The stage that maps the key images with one of COLMAP's mappers."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from colmap_av1.errors import ModelError
+from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.geometry.posed_model import (
+    PosedModel,
+    posed_model,
+    read_posed_model,
+    write_posed_model,
+)
+from colmap_av1.images.image_set import ImageSet
+from colmap_av1.options import MapOptions
+from colmap_av1.poses.adjusting import refines_intrinsics, with_second_distortion
+from colmap_av1.poses.mapper import map_poses
+from colmap_av1.poses.match_stage import MatchesResult
+from colmap_av1.poses.posed_images import PosesResult, registered_by_video
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.start_tracks import keep_start_tracks
+from colmap_av1.poses.track_stage import LEAST_IMAGES
+from colmap_av1.util.digests import digest_of
+from colmap_av1.util.stages import Kept, run_stage
+
+# With fewer tracks per image than this, a failed initialization is blamed on the tracks.
+_FEW_TRACKS = 100
+
+
+@dataclass(frozen=True)
+class MappedResult(PosesResult):
+    """Result of `mapping_stage`.
+
+    Attributes:
+        mapper: the mapper of COLMAP that estimated the poses.
+        other_models: files of further models, which are not connected to the first.
+    """
+
+    mapper: str
+    other_models: tuple[str, ...]
+
+
+def mapping_stage(
+    run: Run, matched: Kept[MatchesResult], image_set: ImageSet, keyed: ImageSet
+) -> Kept[MappedResult]:
+    """Estimate the poses of the key images with COLMAP's mapper."""
+    options, clock, progress = run.options, run.clock, run.progress
+    mapping = options.mapping
+    found_before = matched.result
+    forward = found_before.forward_motion
+    mappers: list[Literal["incremental", "global"]]
+    if mapping.mapper != "auto":
+        mappers = [mapping.mapper]
+    else:
+        # The global mapper needs the focal length. A zoom would mislead its estimate.
+        mappers = (
+            ["incremental"] if found_before.assumes_focal_length else ["global", "incremental"]
+        )
+    links = found_before.links
+    reasons = {reason for gap in links.gaps for reason in gap.reasons}
+    depends_on_links = links.num_between or reasons & {"contradicted", "few tracks"}
+    # Where poses depend on links, walks with fast turns bend if the mapper ends early.
+    ends_early = mapping.adjust and not depends_on_links
+    attempts = [
+        MapOptions(
+            mapper=mapper,
+            forward_motion=forward and mapper == "incremental",
+            refine_intrinsics=refines_intrinsics(options),
+            seed=run.context.seed,
+            num_threads=mapping.mapper_threads,
+        )
+        for mapper in mappers
+    ]
+
+    def map_with(map_options: MapOptions, database: Path) -> list[PosedModel]:
+        with tempfile.TemporaryDirectory() as models:
+            sizes = map_poses(
+                database,
+                Path(models),
+                map_options,
+                image_path=None,
+                log=run.stages / "mapper.log",
+                num_images=len(keyed.images.names),
+                progress=progress,
+                ends_early=ends_early,
+            )
+            found = [
+                posed_model(read_model(Path(models) / str(number)), with_points=True)
+                for number, size in enumerate(sizes)
+                if size >= LEAST_IMAGES
+            ]
+        return [with_second_distortion(run, model) for model in found]
+
+    def make(partial: Path) -> MappedResult:
+        with clock.measure("poses"):
+            for attempt in attempts:
+                # pycolmap migrates the databases that it opens to its own layout.
+                database = partial / f"{attempt.mapper}.db"
+                shutil.copyfile(run.output / "database.db", database)
+                if attempt.mapper == "global" and mapping.adjust:
+                    keep_start_tracks(database)
+                try:
+                    found = map_with(attempt, database)
+                except ModelError:
+                    if attempt is attempts[-1]:
+                        raise
+                    continue
+                if found:
+                    break
+        if not found:
+            raise ModelError(_why_no_initial_pair(found_before, attempt.mapper))
+        found = _largest_first(found, image_set, keyed)
+        (partial / "poses").mkdir()
+        files = [f"poses/{number}.npz" for number in range(len(found))]
+        for file, model in zip(files, found, strict=True):
+            write_posed_model(partial / file, PosedModel(model.cameras, model.images))
+        return MappedResult(
+            poses=files[0],
+            num_registered=len(found[0].images),
+            registered=registered_by_video(found[0].by_name, keyed),
+            mapper=attempt.mapper,
+            other_models=tuple(files[1:]),
+        )
+
+    return run_stage(
+        run.stages,
+        "poses",
+        [
+            matched.digest,
+            attempts,
+            mapping.adjust,
+            ends_early,
+        ],
+        MappedResult,
+        products=["poses"],
+        make=make,
+    )
+
+
+def _largest_first(
+    models: list[PosedModel], image_set: ImageSet, keyed: ImageSet
+) -> list[PosedModel]:
+    """Sort models by the number of images whose nearest key image they have."""
+    return sorted(models, key=lambda model: -num_nearest(model, image_set, keyed))
+
+
+def num_nearest(model: PosedModel, image_set: ImageSet, keyed: ImageSet) -> int:
+    """The number of images whose nearest key image is in a model.
+
+    Args:
+        model: a model of key images.
+        image_set: all images.
+        keyed: all key images.
+    """
+    key = keyed.images.frames
+    nearest = np.searchsorted((key[1:] + key[:-1]) / 2, image_set.images.frames)
+    is_in_model = np.isin(keyed.images.names, list(model.by_name))
+    return int(np.count_nonzero(is_in_model[nearest]))
+
+
+def with_model_first(
+    run: Run, mapped: Kept[MappedResult], keyed: ImageSet, file: str
+) -> Kept[MappedResult]:
+    """The models of the mapper, with another one as the first.
+
+    Args:
+        run: the run.
+        mapped: the models, see `mapping_stage`.
+        keyed: the key images.
+        file: the file of the new first model.
+    """
+    placed = read_posed_model(run.stages / file).by_name
+    others = [own for own in (mapped.result.poses, *mapped.result.other_models) if own != file]
+    result = replace(
+        mapped.result,
+        poses=file,
+        num_registered=len(placed),
+        registered=registered_by_video(placed, keyed),
+        other_models=tuple(others),
+    )
+    return replace(mapped, result=result, digest=digest_of([mapped.digest, file]))
+
+
+def _why_no_initial_pair(found: MatchesResult, mapper: str) -> str:
+    """Why a mapper found no initial pair, and the remedy."""
+    failure = f"COLMAP's {mapper} mapper finds no initial pair"
+    other = "incremental" if mapper == "global" else "global"
+    most_agree = found.num_verified_pairs >= found.num_pairs / 2
+    if most_agree and found.num_flat_pairs > found.num_verified_pairs / 2:
+        return (
+            f"{failure}: too little parallax, in {found.num_flat_pairs} of "
+            f"{found.num_verified_pairs} pairs the camera only rotates or the scene is flat: "
+            "move sideways while filming, or give a longer part of the video"
+        )
+    if not most_agree or found.keypoints_per_image < _FEW_TRACKS:
+        return (
+            f"{failure}: too few tracks, {found.keypoints_per_image:.0f} per image and "
+            f"{found.num_verified_pairs} of {found.num_pairs} verified pairs: "
+            "'colmap-av1 info' tells what the stream lacks, --reencode 1 converts it again"
+        )
+    if found.assumes_focal_length:
+        return (
+            f"{failure}: the focal length is a default and may be far off, or there is too little "
+            "parallax, as when the camera moves along its optical axis: "
+            f"give --camera_model and --camera_params, or try --mapper {other}"
+        )
+    return (
+        f"{failure}: too little parallax between images that share tracks, or wrong intrinsics: "
+        f"give --camera_model and --camera_params, or try --mapper {other}"
+    )

@@ -1,0 +1,105 @@
+"""The stage that estimates the poses of the images between the key images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from colmap_av1.geometry.colmap_model import ModelImage
+from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
+from colmap_av1.geometry.resection import interpolate_poses, resect, sightings_of
+from colmap_av1.geometry.track_points import seen_in
+from colmap_av1.images.image_set import ImageSet
+from colmap_av1.options import DensityOptions
+from colmap_av1.poses.posed_images import (
+    FOR_POSES,
+    PosedImages,
+    PosesResult,
+    check_agreement,
+    read_posed_images,
+    registered_by_video,
+    triangulate_in,
+)
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import pose_tracks
+from colmap_av1.tracks.selection import select_tracks
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.progress import progress_in
+from colmap_av1.util.stages import Kept, run_stage
+
+# The selection of tracks for resection, and the fewest views of a point by key images.
+_RESECTED = DensityOptions(
+    preset="sparse", max_tracks_per_image=500, spacing=16.0, min_images=3, max_sigma=0.0
+)
+_FEWEST_VIEWS = 3
+
+
+def resection_stage(
+    run: Run, tracks: Tracks, image_set: ImageSet, keyed: ImageSet, posed: Kept[PosesResult]
+) -> Kept[PosesResult]:
+    """Estimate the poses of the images between the key images by resection."""
+
+    def make(partial: Path) -> PosesResult:
+        known = read_posed_images(run, posed, keyed)
+        with run.clock.measure("resection"):
+            placed = _resect(run, tracks, image_set, known)
+        model = PosedModel(known.cameras, placed)
+        write_posed_model(partial / "placed.npz", model)
+        return PosesResult("placed.npz", len(placed), registered_by_video(model.by_name, image_set))
+
+    return run_stage(
+        run.stages,
+        "resection",
+        [posed.digest, run.context.seed],
+        PosesResult,
+        products=["placed.npz"],
+        make=make,
+    )
+
+
+def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -> list[ModelImage]:
+    """The key images with a pose, and the images between them that get one."""
+    seen_thrice = pose_tracks(run, tracks).keep_observed_in(known.frames, _FEWEST_VIEWS)
+    spread = select_tracks(seen_thrice.keep_frames(image_set.images.frames), _RESECTED)
+    seen, view = seen_in(spread, known.frames)
+    points = triangulate_in(run, known, seen, view, options=FOR_POSES)
+    check_agreement(len(points.xyz), points.num_tracks)
+    pose_of = {
+        frame: (image.camera_id, image.cam_from_world)
+        for frame, image in zip(known.frames.tolist(), known.images, strict=True)
+    }
+    for video in sorted(
+        {int(sequence) for sequence in known.sequence if sequence < len(image_set.videos)}
+    ):
+        own = np.flatnonzero(known.sequence == video)
+        frames = known.frames[own]
+        images = image_set.images_of(video)
+        left = np.setdiff1d(image_set.images.frames[images.start : images.stop], frames)
+        if len(left) == 0:
+            continue
+        camera_id = known.images[own[0]].camera_id
+        camera = known.cameras[camera_id]
+        guesses = interpolate_poses(
+            np.array([known.images[i].cam_from_world for i in own]), frames, left
+        )
+        found = resect(
+            sightings_of(points, seen, spread, left, [camera] * len(left)),
+            guesses,
+            np.full(len(left), camera.mean_focal_length()),
+            seed=run.context.seed,
+            num_threads=run.context.num_threads,
+            progress=progress_in(run.progress, "resection", len(left)),
+        )
+        pose_of |= {
+            frame: (camera_id, pose)
+            for frame, pose in zip(left.tolist(), found, strict=True)
+            if pose is not None
+        }
+    return [
+        ModelImage(i + 1, name, *pose_of[frame])
+        for i, (name, frame) in enumerate(
+            zip(image_set.images.names, image_set.images.frames.tolist(), strict=True)
+        )
+        if frame in pose_of
+    ]
