@@ -305,6 +305,13 @@ def test_damaged_files_are_written_again(copy: Path) -> None:
     assert contents(copy) == before
 
 
+def test_tracks_of_another_length_are_matched_again(copy: Path) -> None:
+    """Points use tracks of three frames in any case, but poses only if the option says so."""
+    tracks = replace(OPTIONS.match.tracks, min_length=3)
+    shorter = replace(OPTIONS, match=replace(OPTIONS.match, tracks=tracks))
+    assert not {"tracks", "matches"} & set(reconstruct(SCENE, copy, options=shorter).resumed)
+
+
 def test_changed_option_redoes_the_stages_that_depend_on_it(
     made: ReconstructReport, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
