@@ -7,9 +7,6 @@ agree with them are matched: the corners and SIFT links used in the adjustment, 
 
 from __future__ import annotations
 
-import copy
-import math
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,8 +16,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.database.listed import listed_cameras
-from colmap_av1.database.reading import read_images
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, reprojection_errors
 from colmap_av1.geometry.track_points import seen_in
@@ -30,10 +25,10 @@ from colmap_av1.matching.mapper_limits import POINT_MIN_ANGLE
 from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
-from colmap_av1.poses.adjusting import focal_length_errors, refines_intrinsics
 from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.estimate import Posed, estimate_poses
 from colmap_av1.poses.further_models import further_poses
+from colmap_av1.poses.joint_cameras import joint_cameras
 from colmap_av1.poses.long_range_stage import LongRangeResult
 from colmap_av1.poses.matched_observations import (
     NUM_OBSERVATIONS,
@@ -72,11 +67,6 @@ _SIFT_CONTRAST = 0.02
 _SAME_POINT = 1.0
 # Two tracks of one video this close to each other, in pixels, are the same.
 _SAME_TRACK = 0.01
-# A focal length is determined if its relative standard deviation is below this. On walks with turns
-# the standard deviation is 0.5 % and the true error 0.1 to 0.3 %; on a straight drive they are 1.3
-# and 7 %. With the adjusted focal length, COLMAP's mapper registers all images of the drive; with
-# the assumed one, 5 of 51.
-_FOCAL_LENGTH_ERROR = 0.03
 # If a larger share of the images is not registered, the estimate has failed.
 _MAX_LEFT = 0.5
 # Largest number of matches of the initial pair.
@@ -166,7 +156,9 @@ def match_jointly(
         others = within_models(others, left, model_of, image_set)
         agreeing = [_agreeing_tracks(model, image_set, others, density) for model in models]
         paired = _paired(run, image_set, agreeing, others, density)
-    cameras = _cameras(run, image_set, models)
+    cameras = joint_cameras(
+        run, image_set, [(m.known, {i.name for i in m.placed.images}) for m in models]
+    )
     matched = verify_images(paired, cameras, run.options.match.verify, run.context)
     warnings = _warnings(far, models, left, others, image_set)
     if first.adjusted.seams_warning is not None:
@@ -380,68 +372,6 @@ def _paired(
         track = paired.keypoints[start.first].track[matches[number][:, 0]]
         matches[number] = matches[number][np.isin(track, start.points)]
     return replace(paired, matches=matches)
-
-
-def _cameras(run: Run, image_set: ImageSet, models: Sequence[_Model]) -> list[pycolmap.Camera]:
-    """The camera of each image.
-
-    Cameras of an existing database stay unchanged. If the focal length of a video changes, each of
-    its images has its own adjusted camera. Otherwise the images of a video have the adjusted camera
-    of its largest model, if the focal length was estimated from tracks or the model determines it;
-    if not, the assumed one.
-    """
-    if run.cameras is not None:
-        return run.cameras.of_images
-    listed = read_images(run.output / "database.db")
-    names = [image.name for image in listed]
-    matched = dict(
-        zip(names, listed_cameras(run.output / "database.db", listed, names), strict=True)
-    )
-    named = list(zip(image_set.sequence.tolist(), image_set.images.names, strict=True))
-    of_sequence = {sequence: matched[name] for sequence, name in named if name in matched}
-    initial = [of_sequence[sequence] for sequence, _ in named]
-    # Images share a camera if it is the same object, see `ImageMatches`. The adjusted cameras of
-    # the images that share each: in the first model that has any of them, or in all if the focal
-    # length changes.
-    sharing: dict[int, dict[int, pycolmap.Camera]] = {}
-    determined = dict[int, bool]()
-    for model in models:
-        own = defaultdict[int, dict[int, pycolmap.Camera]](dict)
-        in_model = {image.name: image.camera_id for image in model.placed.images}
-        for i, (_, name) in enumerate(named):
-            if name in in_model:
-                own[id(initial[i])][i] = model.known.cameras[in_model[name]]
-        new = {key: adjusted for key, adjusted in own.items() if key not in sharing}
-        for key in own.keys() & sharing.keys():
-            if _have_several_cameras(sharing[key]) or _have_several_cameras(own[key]):
-                sharing[key] |= own[key]
-        sharing |= new
-        assumed = any(
-            not initial[i].has_prior_focal_length for images in new.values() for i in images
-        )
-        errors = {}
-        if assumed and refines_intrinsics(run.options):
-            with run.clock.measure("adjustment"):
-                errors = focal_length_errors(model.known)
-        for number, camera in model.known.cameras.items():
-            camera.has_prior_focal_length = True  # models do not store it
-            determined[id(camera)] = errors.get(number, math.inf) < _FOCAL_LENGTH_ERROR
-    cameras = []
-    for i, camera in enumerate(initial):
-        adjusted = sharing.get(id(camera), {})
-        if _have_several_cameras(adjusted):
-            places = np.array(list(adjusted))
-            nearest = adjusted[int(places[np.argmin(np.abs(places - i))])]
-            cameras.append(nearest if i in adjusted else copy.copy(nearest))
-            continue
-        found = next(iter(adjusted.values()), camera)
-        is_known = camera.has_prior_focal_length or determined.get(id(found), False)
-        cameras.append(found if is_known else camera)
-    return cameras
-
-
-def _have_several_cameras(camera_of_image: dict[int, pycolmap.Camera]) -> bool:
-    return len(set(map(id, camera_of_image.values()))) > 1
 
 
 def _focal_length(run: Run, camera: pycolmap.Camera) -> float | None:
