@@ -174,6 +174,18 @@ def test_trainer_finds_the_masks_of_the_images(copy: Path) -> None:
     masked = reconstruct(SCENE, copy, options=replace(OPTIONS, moving="mask"))
     for name, masks in brush(masked.output).masks.items():
         assert masks == {masked.output / "masks" / Path(name).with_suffix(".png").name}
+    reconstruct(SCENE, copy, options=OPTIONS)
+    assert not (copy / "masks").exists()
+
+
+def test_masks_of_the_user_stay_in_the_output(copy: Path) -> None:
+    mine = copy / "masks" / "mine.png"
+    mine.parent.mkdir()
+    mine.write_bytes(b"mine")
+    resumed = reconstruct(SCENE, copy, options=OPTIONS)
+    again = reconstruct(SCENE, copy, options=replace(OPTIONS, undistort=False))
+    assert ("model" in resumed.resumed, "model" in again.resumed) == (True, False)
+    assert mine.read_bytes() == b"mine"
 
 
 def test_poses_are_accurate(made: ReconstructReport, truth: Truth) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -310,7 +309,7 @@ def model_stage(
         )
 
     how = (options.triangulate, options.match.images.file_name, options.moving, options.undistort)
-    kept = run_stage(
+    return run_stage(
         run.stages,
         "model",
         [posed.digest, how],
@@ -319,7 +318,3 @@ def model_stage(
         products=["images", "sparse", *([_MASKS] if masked else [])],
         make=make,
     )
-    if not masked:
-        # Remove masks of an earlier run with other options.
-        shutil.rmtree(run.output / _MASKS, ignore_errors=True)
-    return kept

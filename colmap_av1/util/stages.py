@@ -110,7 +110,7 @@ def run_stage(
     """Run a stage, unless an earlier run finished it with the same input.
 
     The products appear under their names only when they are complete. Until then earlier products
-    stay. Only files of an earlier run are replaced.
+    stay. Only files of an earlier run are replaced or removed.
 
     Args:
         stages: the folder of the stages.
@@ -243,18 +243,14 @@ def _write_record(record: Path, body: dict[str, Any]) -> None:
 
 
 def _put_in_place(record: Path, made: Path, into: Path, products: Sequence[str]) -> list[Path]:
-    """Move products into place, replacing those of an earlier run, and return their files there.
+    """Move products into place, remove those of an earlier run, and return the new files.
 
     Until the new record is written, the old record lists the files of both runs. If this run is
     killed, the next run therefore knows that none of the files is a user's.
     """
     body = _read_record(record)
     listed = [] if body is None else body["files"]
-    earlier = {
-        name
-        for name in listed
-        if _is_inside(into, name) and any(Path(name).is_relative_to(p) for p in products)
-    }
+    earlier = {name for name in listed if _is_inside(into, name)}
     files = [path.relative_to(made) for product in products for path in _files_of(made / product)]
     new = {path.as_posix() for path in files}
     if body is not None:  # without a record it is unknown whose the existing files are

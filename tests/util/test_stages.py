@@ -355,6 +355,15 @@ def test_second_run_only_replaces_files_of_the_first(tmp_path: Path) -> None:
     assert texts(output) == {**theirs, **dict.fromkeys(mine, "mine")}
 
 
+def test_run_without_a_product_removes_that_of_the_run_before(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    run_with(output, 1, ["images/0.png", "masks/0.png", "other/0.png"])
+    (output / "masks" / "mine.png").write_text("mine")
+    run_with(output, 2, ["images/0.png"])
+    assert texts(output) == {"images/0.png": "2", "masks/mine.png": "mine"}
+    assert not (output / "other").exists()
+
+
 def test_existing_file_of_the_user_is_refused(tmp_path: Path) -> None:
     output = tmp_path / "out"
     run_with(output, 1, ["images/0.png"])
