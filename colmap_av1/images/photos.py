@@ -23,9 +23,9 @@ from colmap_av1.video.unchanged import FileState, file_state
 # files next to photos.
 _UNREADABLE_PHOTOS = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
 _NUM_NAMED = 3
-_JPEG = {".jpg", ".jpeg"}
-# Markers of JPEG (ITU-T T.81, table B.1); neither occurs within a scan.
-_START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
+# Markers of JPEG (ITU-T T.81, table B.1). The end of the image does not occur within a scan.
+_START_OF_IMAGE, _END_OF_IMAGE, _START_OF_SCAN = b"\xff\xd8", b"\xff\xd9", b"\xda"
+_MARKER = re.compile(rb"\xff+([^\x00\xff])")
 
 
 @dataclass(frozen=True)
@@ -134,10 +134,16 @@ def _place_of(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
 
 def _is_cut_short(path: Path) -> bool:
     """Whether a JPEG file is truncated; decoders would fill the missing part with grey."""
-    if path.suffix.lower() not in _JPEG:
-        return False
     data = path.read_bytes()
-    return data.rfind(_END_OF_IMAGE) < data.rfind(_START_OF_SCAN)
+    if not data.startswith(_START_OF_IMAGE):
+        return False
+    # Segments are skipped by their lengths because one may hold a thumbnail, which has the same
+    # markers. What follows the image, such as the video of a motion photo, is not read.
+    marker = _MARKER.search(data, len(_START_OF_IMAGE))
+    while marker is not None and marker[1] != _START_OF_SCAN:
+        length = int.from_bytes(data[marker.end() : marker.end() + 2], "big")
+        marker = _MARKER.search(data, marker.end() + length)
+    return marker is None or data.find(_END_OF_IMAGE, marker.end()) < 0
 
 
 def _flat(file: Path) -> str:

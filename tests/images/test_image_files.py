@@ -179,6 +179,27 @@ def test_image_names_must_be_utf_8(tmp_path: Path) -> None:
     assert photo.name == "photos/_.png"
 
 
+def test_only_photos_that_are_cut_short_are_refused(tmp_path: Path) -> None:
+    """A thumbnail in the header and a video after the image may have any markers of JPEG."""
+    picture = np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    data = cv2.imencode(".jpg", picture)[1].tobytes()
+    thumbnail = cv2.imencode(".jpg", picture[:8, :8])[1].tobytes()
+    segment = b"\xff\xff\xe5" + (2 + len(thumbnail)).to_bytes(2, "big") + thumbnail
+    photos = {
+        "plain.jpg": data,
+        "with_thumbnail.jpg": data[:2] + segment + data[2:],
+        "motion.jpg": data + b"\0\0\0\x08ftyp\xff\xd9\xff\xda",
+    }
+    for name, content in photos.items():
+        (tmp_path / name).write_bytes(content)
+        assert len(read_photos(tmp_path, [Path(name)], "photos", flat=False)) == 1
+        end = content.index(data[2:]) + len(data) - 2
+        for length in (end - 2, end - len(data) // 2):
+            (tmp_path / name).write_bytes(content[:length])
+            with pytest.raises(ImageError, match=f"{name}: is damaged"):
+                read_photos(tmp_path, [Path(name)], "photos", flat=False)
+
+
 @pytest.mark.parametrize("ending", ["png", "jpg"])
 def test_existing_images_of_another_size_are_refused(tmp_path: Path, ending: str) -> None:
     name = f"frame_000003.{ending}"
