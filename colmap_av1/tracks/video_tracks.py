@@ -116,7 +116,7 @@ def open_source(
     Raises:
         VideoError: the video cannot be converted.
         EncodeError: no AV1 encoder works, or the stream cannot be written.
-        OptionError: `keep_stream` names a file that is not a stream of this video.
+        OptionError: `keep_stream` names an existing file that is not a kept stream.
     """
     # A killed run may have left its stream here, even if this video needs no conversion.
     remove_leftovers(next_to.resolve().parent, next_to.resolve().name)

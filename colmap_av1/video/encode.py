@@ -49,8 +49,8 @@ from colmap_av1.video.unchanged import unchanged
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".webm": "webm", ".ivf": "ivf"}
 # Number of bytes at the start, in the middle and at the end of a video that identify it.
 _SAMPLE = 1 << 16
-# Begins the comment tag that records the source and settings of a stream, by which a kept stream
-# is recognized.
+# Begins the comment tag that records the settings of a stream. A kept stream is recognized by the
+# source that its tag records, too.
 _MARK = "colmap-av1"
 # Containers that store the tag.
 _KEPT_FORMATS = (".mp4", ".mkv", ".webm")
@@ -115,6 +115,30 @@ def encode(
         >>> report.num_frames
         60
     """
+    return _encode(
+        video,
+        output,
+        overwrite=overwrite,
+        strict=strict,
+        telemetry=telemetry,
+        options=options,
+        progress=progress,
+        is_kept=False,
+    )
+
+
+def _encode(
+    video: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    overwrite: bool,
+    strict: bool,
+    telemetry: bool,
+    options: EncodeOptions,
+    progress: Progress,
+    is_kept: bool,
+) -> EncodeReport:
+    """Do the work of `encode`; `is_kept` marks the output as a kept stream of the video."""
     path, output = Path(video), Path(output)
     if output.suffix.lower() not in _FORMATS:
         raise OptionError(f"{output}: give an output that ends in {', '.join(_FORMATS)}")
@@ -151,9 +175,11 @@ def encode(
         *copied,
     ]
     # fmt: on
-    mark = {"encoder": name, "quality": quality, "speed": speed, "source": _source(path)}
+    mark: dict[str, object] = {"encoder": name, "quality": quality, "speed": speed}
     if scaling(options):
         mark["downscale"] = float(options.downscale or 1)
+    if is_kept:
+        mark["source"] = _source(path)
 
     def convert(partial: Path, num_frames: int | None = None) -> int:
         total = num_frames or file.num_packets
@@ -179,7 +205,9 @@ def encode(
                 count = convert(partial, readable)
     except OSError as error:
         raise EncodeError(cannot_write(output, error)) from error
-    _warn(loss_of(file, positions, output))
+    loss = loss_of(file, positions, output)
+    if loss is not None:
+        warnings.warn(loss, stacklevel=3)
     return EncodeReport(output, encoder.ffmpeg_name, count)
 
 
@@ -194,7 +222,8 @@ def stream_of(
     """The AV1 stream of a video in another codec: the stream kept by an earlier run, or a new one.
 
     A kept stream is reused if it is complete, newer than the video, and made from a file of the
-    same size and content with the settings that `options` ask for.
+    same size and content with the settings that `options` ask for. Otherwise it is replaced. Only
+    streams that this function wrote are kept streams, those of `encode` are not.
 
     Args:
         video: a video that ffmpeg decodes.
@@ -221,8 +250,8 @@ def stream_of(
         mark = _mark_of(output)
         if mark is None:
             raise OptionError(
-                f"{output}: exists and is not a stream kept for {path.name}: give another "
-                "--keep_stream, or remove it"
+                f"{output}: exists and is not a kept stream: give another --keep_stream, or remove "
+                "it"
             )
         if _fits(mark, path, options) and output.stat().st_mtime_ns >= path.stat().st_mtime_ns:
             kept = _count_packets(output)
@@ -236,8 +265,16 @@ def stream_of(
             f"{output.resolve().parent}: the AV1 stream of {path.name} cannot be written there: "
             "give another place with --keep_stream"
         )
-    how = {"overwrite": True, "strict": strict, "telemetry": False}
-    return encode(file, output, **how, options=options, progress=progress)
+    return _encode(
+        file,
+        output,
+        overwrite=True,
+        strict=strict,
+        telemetry=False,
+        options=options,
+        progress=progress,
+        is_kept=True,
+    )
 
 
 def _filters(video: Video, options: EncodeOptions) -> list[str]:
@@ -335,11 +372,6 @@ def _readable_frames(video: VideoFile, count: int, strict: bool) -> int:
     return readable
 
 
-def _warn(text: str | None) -> None:
-    if text is not None:
-        warnings.warn(text, stacklevel=3)
-
-
 def _warn_of_damage(video: VideoFile, readable: int, reason: str) -> None:
     warnings.warn(
         f"{video}: damaged after {readable} of {video.num_packets} frames, only these are used: "
@@ -383,7 +415,7 @@ def _mark(facts: Mapping[str, object]) -> str:
 
 
 def _mark_of(stream: Path) -> dict[str, str] | None:
-    """The source and settings recorded in a kept stream; None if it has no record."""
+    """The source and settings recorded in a kept stream; None for other files."""
     try:
         with av.open(os.path.abspath(stream)) as opened:
             tags = {key.lower(): value for key, value in opened.metadata.items()}
@@ -392,7 +424,8 @@ def _mark_of(stream: Path) -> dict[str, str] | None:
     name, *words = tags.get("comment", "").split(" ")
     if name != _MARK or not all("=" in word for word in words):
         return None
-    return dict(word.split("=", 1) for word in words)
+    mark = dict(word.split("=", 1) for word in words)
+    return mark if "source" in mark else None
 
 
 def _fits(mark: Mapping[str, str], video: Path, options: EncodeOptions) -> bool:

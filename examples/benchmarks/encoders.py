@@ -42,7 +42,7 @@ from colmap_av1.evaluate import pose_errors, run_measured
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
-from colmap_av1.video.encode import encode
+from colmap_av1.video.encode import stream_of
 from colmap_av1.video.encoders import find_encoder
 
 HARDWARE = (
@@ -178,7 +178,7 @@ def converted(source: Path, folder: Path, setting: EncodeOptions) -> tuple[Path,
 
     def make() -> dict[str, Any]:
         before = os.times()
-        encode(source, stream, options=setting)
+        stream_of(source, stream, options=setting)
         after = os.times()
         spent = after.children_user + after.children_system
         return {"cpu_seconds": spent - before.children_user - before.children_system}

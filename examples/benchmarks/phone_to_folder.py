@@ -41,7 +41,6 @@ from colmap_av1 import (
     MapOptions,
     MatchOptions,
     ReconstructOptions,
-    encode,
     match,
     reconstruct,
 )
@@ -59,6 +58,7 @@ from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 from colmap_av1.video.coded_size import with_downscale
+from colmap_av1.video.encode import stream_of
 from colmap_av1.video.facts import read_video
 
 RENDERED = re.compile(r"phone_(\d+)s")
@@ -287,7 +287,7 @@ def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str
 def run_encode(video: Path, stream: Path) -> None:
     """Convert a video like `reconstruct`."""
     options = with_downscale(EncodeOptions(effort="quick"), read_video(video).picture_size)
-    encode(video, stream, options=options)
+    stream_of(video, stream, options=options)
 
 
 def run_reconstruct(video: Path, output: Path, options: ReconstructOptions) -> None:

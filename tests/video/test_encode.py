@@ -279,6 +279,12 @@ def test_files_that_are_not_streams_are_not_replaced(phone: Path, tmp_path: Path
         encode_video(video, video, overwrite=True)
     assert other.read_bytes() == video.read_bytes() == phone.read_bytes()
     assert encode_video(video, other, overwrite=True).num_frames == 12
+    # Streams of `encode` are files of the user, too, even if they are made from a kept stream.
+    kept = stream_of(video, tmp_path / "kept.mp4").output
+    encode_video(kept, tmp_path / "again.mp4")
+    for made in (other, tmp_path / "again.mp4"):
+        with pytest.raises(OptionError, match="exists"):
+            stream_of(video, made)
 
 
 def test_match_accepts_any_codec(phone: Path, tmp_path: Path) -> None:
