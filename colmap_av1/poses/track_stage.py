@@ -109,11 +109,12 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     )
     tracking = replace(options.tracking, tracks=chaining)
     name, shown = stage_of_video(run, video), source.pictures
-    is_long = not options.images.ways and count_frames(source) > run.options.max_images
+    count = 0 if options.images.ways else count_frames(source, options.read)
+    is_long = count > run.options.max_images
 
     def make(partial: Path) -> TracksResult:
         if is_long:
-            found = _track_long(run, video, tracking)
+            found = _track_long(run, video, tracking, count)
         else:
             found = _track_and_choose(run, video, tracking, partial)
         chosen, tracked = found.chosen, found.video
@@ -186,7 +187,7 @@ def _track_and_choose(
     return track_images(source, options, choose, masks=masks, context=run.context)
 
 
-def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages:
+def _track_long(run: Run, video: int, options: TrackingOptions, count: int) -> TrackedImages:
     """Track a video with more frames than `max_images`, and keep the chosen images only.
 
     The images are chosen from evenly spread candidate frames. The motion is read twice, first with
@@ -194,7 +195,6 @@ def _track_long(run: Run, video: int, options: TrackingOptions) -> TrackedImages
     rolling shutter is corrected or tracks are refined, both of which need other frames.
     """
     source = run.sources[video]
-    count = count_frames(source)
     candidates = np.array(evenly_spread(count, _CANDIDATES * run.options.max_images), np.int32)
     width, height = source.stream.picture_size
     held = len(candidates) * width * height / _PIXELS_PER_OBSERVATION

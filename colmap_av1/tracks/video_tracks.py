@@ -37,7 +37,7 @@ from colmap_av1.video.coded_size import coded_size, with_downscale
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.encode import EncodeReport, encode, stream_of
-from colmap_av1.video.facts import Video, frame_times, read_video, with_counted_packets
+from colmap_av1.video.facts import Video, frame_times, read_video
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import FileState
 
@@ -315,11 +315,14 @@ def _inter_share(
     return np.array([share[a:b].min() for a, b in zip(starts, ends, strict=True)], np.float32)
 
 
-def count_frames(source: VideoSource) -> int:
-    """Number of frames of a video that players show, according to its container."""
-    if source.pictures.presented is not None:
-        return len(source.pictures.presented)
-    return with_counted_packets(source.stream).num_packets or 0
+def count_frames(source: VideoSource, options: ReadOptions) -> int:
+    """Number of frames of a video that players show, according to the headers of its stream.
+
+    The container gives too large a number if the file is cut short.
+    """
+    num_shown = len(first_showings(source.stream, options))
+    presented = source.pictures.presented
+    return num_shown if presented is None else int((presented < num_shown).sum())
 
 
 def times_of_frames(source: VideoSource, num_frames: int) -> NDArray[np.float64] | None:

@@ -17,6 +17,7 @@ from colmap_av1.tracks.tracks import build_tracks
 from colmap_av1.tracks.video_tracks import (
     TrackedVideo,
     VideoSource,
+    count_frames,
     decodable_frames,
     open_source,
     times_of_frames,
@@ -121,6 +122,19 @@ def test_frames_that_are_not_shown_have_no_tracks(trimmed: Path) -> None:
     times = times_of_frames(source, 11)
     assert times is not None
     np.testing.assert_allclose(np.diff(times), 1 / 25)
+
+
+def test_frames_of_a_file_that_is_cut_short_are_counted(
+    clip: Path, trimmed: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """The container lists all frames, but the file ends after some of them."""
+    assert count_frames(opened(trimmed), ReadOptions()) == 11
+    short = ffmpeg("-i", clip, "-c", "copy", "-movflags", "faststart", tmp_path / "short.mp4")
+    os.truncate(short, short.stat().st_size // 2)
+    source = opened(short)
+    assert source.stream.num_packets == 16
+    count = count_frames(source, ReadOptions())
+    assert 1 < count == tracked(source).tracks.num_frames < 16
 
 
 def test_frame_times_are_given_for_all_frames_or_none(
