@@ -42,7 +42,7 @@ def is_new(path: Path) -> bool:
         return False
     if not target.parent.is_dir():
         raise DatabaseError(f"{path}: the folder does not exist: create it first")
-    for leftover in _logs(path):
+    for leftover in _logs(target):
         # SQLite would replay such a journal into a new database of the same name.
         if leftover.exists():
             raise DatabaseError(f"{leftover} is left from another database: remove it first")

@@ -387,8 +387,10 @@ def test_new_database_needs_an_existing_folder(tmp_path: Path) -> None:
 def test_new_database_is_refused_next_to_an_old_log(tmp_path: Path) -> None:
     """SQLite would apply the old log to the new database."""
     (tmp_path / "new.db-wal").write_bytes(b"old")
-    with pytest.raises(DatabaseError, match=r"new\.db-wal"):
-        write_matches(tmp_path / "new.db", NAMES, CAMERA, **ROWS)
+    (tmp_path / "link.db").symlink_to("new.db")
+    for name in ("new.db", "link.db"):
+        with pytest.raises(DatabaseError, match=r"new\.db-wal"):
+            write_matches(tmp_path / name, NAMES, CAMERA, **ROWS)
 
 
 def test_database_without_keypoints_but_with_matches_is_refused(tmp_path: Path) -> None:
