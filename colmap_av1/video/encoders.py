@@ -201,6 +201,7 @@ def _encoders_of(program: str) -> str:
     return run.stdout
 
 
+@functools.cache
 def _probe(program: str, encoder: _Encoder, quality: int, speed: int) -> str | None:
     """Try an encoder. Return why it does not work, or None if it works."""
     # fmt: off
