@@ -1,4 +1,4 @@
-"""Sub-pixel correction of tracks on decoded pictures. This is the first stage that needs pixels."""
+"""Sub-pixel correction of tracks on decoded pictures."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _MATCH_CONSTANT, _MATCH_NOISE, _MATCH_PRIOR = 1.49, 1.17, 0.80
 _REFUSED_SIGMA = 0.7
 # Density of the observations that are corrected for poses: more than a mapper or a bundle
 # adjustment gets, because the observations for these are selected among them.
-_SPREAD = DensityOptions(preset="sparse", max_tracks_per_image=2000, spacing=10.0, max_sigma=0.0)
+_SPREAD = DensityOptions(preset="sparse", max_tracks_per_image=2000, spacing=10.0)
 
 
 def refine_tracks(

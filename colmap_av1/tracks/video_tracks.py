@@ -248,9 +248,9 @@ def track_video(
             tracks = tracks.with_repeats(first)
             if stored is not None:  # the first showing of a frame may not be among the frames
                 tracks = tracks.keep_frames(stored[stored < tracks.num_frames])
-            num_frames, num_tracks = tracks.num_frames, len(tracks.offsets)
+            num_frames, num_tracks = tracks.num_frames, tracks.num_tracks
             tracks = remove_overlays(tracks)
-            overlay_share = 1 - len(tracks.offsets) / num_tracks
+            overlay_share = (num_tracks - tracks.num_tracks) / max(num_tracks, 1)
             tracks = tracks.as_displayed(source.stream.display, presented)
             num_pixels = num_frames * tracks.width * tracks.height
             if source.stream is not source.pictures:

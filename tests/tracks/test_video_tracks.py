@@ -170,8 +170,8 @@ def test_overlay_is_reported(encode: Encode, tmp_path: Path) -> None:
     frames[:, 32:96, 48:112] = frames[0, 32:96, 48:112]
     found = tracked(opened(encode(frames, tmp_path / "logo.mp4")))
     assert plain.warnings == ()
-    num_before = len(build_tracks(read_motion(tmp_path / "logo.mp4")).offsets)
-    share = 1 - len(found.tracks.offsets) / num_before
+    num_before = build_tracks(read_motion(tmp_path / "logo.mp4")).num_tracks
+    share = 1 - found.tracks.num_tracks / num_before
     assert share > 0.05
     (note,) = found.warnings
     assert f"{share:.0%}" in note
