@@ -83,7 +83,8 @@ def refine_tracks(
     """
     if options.refine == "none":
         return tracks
-    state = match_tracks(tracks, frames, options, progress, expected=expected)
+    state = RefinedTracks.start(tracks, options, expected)
+    state.refine_all(frames, progress)
     return replace(
         tracks,
         xy=state.xy,
@@ -133,41 +134,6 @@ def refine_spread_tracks(
     return replace(tracks, xy=xy, sigma=sigma, confirmed=confirmed)
 
 
-def match_tracks(
-    tracks: Tracks,
-    frames: Iterable[tuple[int, NDArray[np.uint8]]],
-    options: RefineOptions,
-    progress: Callable[[int], None] | None = None,
-    *,
-    expected: NDArray[np.bool_] | None = None,
-) -> RefinedTracks:
-    """Do the work of `refine_tracks`, and return how each observation was found.
-
-    Arguments and errors are those of `refine_tracks`.
-    """
-    state = RefinedTracks.start(tracks, options, expected)
-    by_frame, bounds = tracks.by_frame()
-    next_frame = 0
-    for count, (index, image) in enumerate(frames, start=1):
-        if index < next_frame or index >= tracks.num_frames:
-            raise ImageError(f"frame {index} comes out of order: give frames in display order")
-        if image.shape[:2] != (tracks.height, tracks.width):
-            raise ImageError(
-                f"frame {index} is {image.shape[1]}x{image.shape[0]}, the tracks are of "
-                f"{tracks.width}x{tracks.height}: re-encode the video at one size"
-            )
-        for missing in range(next_frame, index):
-            state.skip(by_frame[bounds[missing] : bounds[missing + 1]])
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        state.refine(by_frame[bounds[index] : bounds[index + 1]], grey)
-        next_frame = index + 1
-        if progress is not None:
-            progress(count)
-    for missing in range(next_frame, tracks.num_frames):
-        state.skip(by_frame[bounds[missing] : bounds[missing + 1]])
-    return state
-
-
 @dataclass
 class RefinedTracks:
     """The state of every track after some of the frames.
@@ -176,10 +142,6 @@ class RefinedTracks:
         xy: float32 [num_observations, 2] corrected positions in pixels.
         variance: float64 [num_observations] their expected variance in px^2.
         confirmed: bool [num_observations].
-        source: int64 [num_observations] the observation whose picture each one was matched with;
-            -1 if it is not confirmed.
-        noise: float32 [num_observations] error in pixels that the difference of the matched
-            windows would cause if it were noise; 0 if the observation is not confirmed.
         bitstream_variance: float64 [num_observations] variance before refinement.
     """
 
@@ -195,8 +157,6 @@ class RefinedTracks:
     xy: NDArray[np.float32]
     variance: NDArray[np.float64]
     confirmed: NDArray[np.bool_]
-    source: NDArray[np.int64]
-    noise: NDArray[np.float32]
     templates: _Templates
     last_image: NDArray[np.uint8] | None = None
     last_frame: int = -1
@@ -229,10 +189,35 @@ class RefinedTracks:
             xy=tracks.xy.copy(),
             variance=variance.copy(),
             confirmed=np.zeros(num_observations, dtype=np.bool_),
-            source=np.full(num_observations, -1),
-            noise=np.zeros(num_observations, dtype=np.float32),
             templates=_Templates.empty(tracks, options, int(np.cumsum(alive).max(initial=0))),
         )
+
+    def refine_all(
+        self,
+        frames: Iterable[tuple[int, NDArray[np.uint8]]],
+        progress: Callable[[int], None] | None = None,
+    ) -> None:
+        """Correct the observations in all frames, see `refine_tracks`."""
+        tracks = self.tracks
+        by_frame, bounds = tracks.by_frame()
+        next_frame = 0
+        for count, (index, image) in enumerate(frames, start=1):
+            if index < next_frame or index >= tracks.num_frames:
+                raise ImageError(f"frame {index} comes out of order: give frames in display order")
+            if image.shape[:2] != (tracks.height, tracks.width):
+                raise ImageError(
+                    f"frame {index} is {image.shape[1]}x{image.shape[0]}, the tracks are of "
+                    f"{tracks.width}x{tracks.height}: re-encode the video at one size"
+                )
+            for missing in range(next_frame, index):
+                self.skip(by_frame[bounds[missing] : bounds[missing + 1]])
+            grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+            self.refine(by_frame[bounds[index] : bounds[index + 1]], grey)
+            next_frame = index + 1
+            if progress is not None:
+                progress(count)
+        for missing in range(next_frame, tracks.num_frames):
+            self.skip(by_frame[bounds[missing] : bounds[missing + 1]])
 
     def skip(self, seen: NDArray[np.int64]) -> None:
         """Move the observations in a frame without a picture by the bitstream's steps."""
@@ -255,7 +240,7 @@ class RefinedTracks:
         found = _match(
             templates.atlas, canvas, templates.point[track], self.xy[tracked], self.options
         )
-        sure = self._accept(tracked, found, templates.source[track])
+        sure = self.accept(tracked, found, templates.source[track])
         templates.misses[track[sure]] = 0
         templates.misses[track[~sure]] += 1
 
@@ -268,7 +253,7 @@ class RefinedTracks:
             found = _match(
                 self.last_image, image, self.xy[lost - 1] - 0.5, self.xy[lost], self.options
             )
-            sure = self._accept(lost, found, lost - 1)
+            sure = self.accept(lost, found, lost - 1)
             fresh = lost[sure]
             self.variance[lost[~sure]] += _REFUSED_SIGMA**2
 
@@ -287,7 +272,7 @@ class RefinedTracks:
         self.xy[later] = np.clip(self.xy[later - 1] + self.step[later], 0, limits)
         self.variance[later] = self.variance[later - 1] + self.step_variance[later]
 
-    def _accept(
+    def accept(
         self,
         observations: NDArray[np.int64],
         found: _Matches,
@@ -311,8 +296,6 @@ class RefinedTracks:
         self.variance[taken] = self.variance[source[sure]] + _match_variance(noise, since)
         self.confirmed[taken] = True
         self.shown[taken] = True
-        self.source[taken] = source[sure]
-        self.noise[taken] = noise
         return sure
 
 

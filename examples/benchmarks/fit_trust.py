@@ -26,7 +26,7 @@ from scipy.optimize import minimize
 from sequences import model_poses
 
 from colmap_av1 import FrameMotion, RefineOptions, Tracks, build_tracks, read_motion
-from colmap_av1.tracks.refine import match_tracks
+from colmap_av1.tracks.refine import RefinedTracks
 from colmap_av1.video.decoding import decode_frames
 
 SAMPLES = 40_000  # Number of samples of each clip.
@@ -245,15 +245,30 @@ def unit_traits(frame: FrameMotion) -> Floats:
 
 def match_samples(clip: Clip, tracks: Tracks) -> Samples:
     """Matches of decoded pictures, with their residual and the bitstream's error as features."""
-    refined = match_tracks(tracks, decode_frames(clip.video), RefineOptions(refine="lk"))
-    target = np.flatnonzero(refined.source >= 0)
+    source = np.full(tracks.num_observations, -1)
+    noise = np.zeros(tracks.num_observations, np.float32)
+
+    class Recorded(RefinedTracks):
+        """Records what each observation was matched with."""
+
+        def accept(
+            self, observations: NDArray[np.int64], found: Any, origin: NDArray[np.int64]
+        ) -> NDArray[np.bool_]:
+            sure = super().accept(observations, found, origin)
+            taken = observations[sure]
+            source[taken] = origin[sure]
+            noise[taken] = found.difference[sure] * self.templates.softness[self.track[taken]]
+            return sure
+
+    refined = Recorded.start(tracks, RefineOptions(refine="lk"), None)
+    refined.refine_all(decode_frames(clip.video))
+    target = np.flatnonzero(source >= 0)
     target = target[draw(len(target))]
-    source = refined.source[target]
-    prior = refined.bitstream_variance[target] - refined.bitstream_variance[source]
+    prior = refined.bitstream_variance[target] - refined.bitstream_variance[source[target]]
     traits = np.stack(
         [
             np.ones(len(target)),
-            np.log(0.02 + refined.noise[target]),
+            np.log(0.02 + noise[target]),
             np.log(0.01 + np.maximum(prior, 0)),
         ],
         axis=-1,
@@ -262,7 +277,7 @@ def match_samples(clip: Clip, tracks: Tracks) -> Samples:
         *(tracks.num_frames, tracks.width, tracks.height, tracks.offsets, tracks.frame),
         *(refined.xy, tracks.sigma, refined.confirmed),
     )
-    return known(Samples(clip, traits, clip.errors(found, source, target)))
+    return known(Samples(clip, traits, clip.errors(found, source[target], target)))
 
 
 def known(samples: Samples) -> Samples:
