@@ -24,7 +24,7 @@ from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_prepared
-from colmap_av1.images.recognising import check_content
+from colmap_av1.images.recognising import check_content, frames_near
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.few_matches import matching_warning
 from colmap_av1.matching.gaps import fast_frames
@@ -378,7 +378,11 @@ def _check_images_of_other_runs(
             path = folder / label / name
             if path not in before and path.exists():
                 pictures = decodable_frames(
-                    own.source.pictures, own.tracked.tracks.num_frames, options.reading, own.display
+                    own.source.pictures,
+                    own.tracked.tracks.num_frames,
+                    options.reading,
+                    own.display,
+                    wanted=frames_near([frame]),
                 )
                 check_content([path], [frame], pictures)
                 break

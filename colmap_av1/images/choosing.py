@@ -6,7 +6,7 @@ import itertools
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,13 +25,15 @@ from colmap_av1.images.names import (
     last_number,
     natural_order,
 )
-from colmap_av1.images.recognising import check_content, frames_by_content
+from colmap_av1.images.recognising import check_content, frames_by_content, frames_near
 from colmap_av1.options import ImageOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.texts import read_lines
 
 _Image = NDArray[np.uint8]
+# Yields (display index, picture) of some frames, given by their indices, in order; None: all.
+_Decode = Callable[[Collection[int] | None], Iterable[tuple[int, _Image]]]
 
 # Longer side in pixels at which sharpness is measured.
 _SHARPNESS_SIZE = 640
@@ -82,7 +84,7 @@ def choose_images(
     existing: Sequence[str],
     folder: Path | None,
     times: Callable[[], NDArray[np.float64] | None],
-    decode: Callable[[], Iterable[tuple[int, _Image]]],
+    decode: _Decode,
 ) -> ChosenImages:
     """Choose the frames that become images: the frames of existing images, else by the options.
 
@@ -97,7 +99,8 @@ def choose_images(
         existing: names of existing images, in any order.
         folder: folder of the images; None: no picture is decoded.
         times: returns the times of the frames in seconds; None if unknown.
-        decode: yields (display index, picture) of all frames.
+        decode: yields (display index, picture) of some frames, given by their indices, or with
+            None of all frames.
 
     Raises:
         ImageError: the frames of the existing images cannot be determined, or fewer than two are
@@ -114,7 +117,7 @@ def choose_images(
         at = times() if options.fps or options.num_images else None
         frames = choose_frames(tracks, options, at)
         if folder is not None and options.skip_blurred and (options.fps or options.num_images):
-            frames = skip_blurred(frames, tracks, lambda asked: _sharpness(asked, decode()))
+            frames = skip_blurred(frames, tracks, lambda asked: _sharpness(decode(set(asked))))
         chosen = ChosenImages(image_names(options.file_name, frames.tolist()), frames)
     if len(chosen.frames) < 2:
         raise ImageError(
@@ -320,7 +323,7 @@ def _find_existing(
     options: ImageOptions,
     names: Sequence[str],
     folder: Path | None,
-    decode: Callable[[], Iterable[tuple[int, _Image]]],
+    decode: _Decode,
 ) -> ChosenImages:
     """Find the frames of existing images."""
     wrong = next((n for n in ("num_images", "fps") if getattr(options, n) is not None), None)
@@ -353,28 +356,29 @@ def _find_existing(
         # A wrong start or rate shows at the first or the last image.
         ends = sorted({0, len(chosen.names) - 1})
         paths = [image_file(folder or Path(), chosen.names[k]) for k in ends]
-        check_content(paths, chosen.frames[ends].tolist(), decode())
+        frames_of_ends = chosen.frames[ends].tolist()
+        check_content(paths, frames_of_ends, decode(frames_near(frames_of_ends)))
     return chosen
 
 
 def _by_content(
     names: Sequence[str],
     files: Sequence[Path],
-    decode: Callable[[], Iterable[tuple[int, _Image]]],
+    decode: _Decode,
 ) -> ChosenImages:
     """Find the frames of images by content, without images that repeat the previous one.
 
     FFmpeg's fps filter repeats pictures if the video has a lower rate.
     """
     try:
-        return _in_order(names, frames_by_content(files, decode()))
+        return _in_order(names, frames_by_content(files, decode(None)))
     except ImageError:
         pairs = enumerate(itertools.pairwise(files), start=1)
         repeated = [k for k, (before, file) in pairs if _are_same_bytes(before, file)]
         if not repeated or len(files) - len(repeated) < 2:
             raise
     once = sorted(set(range(len(files))) - set(repeated))
-    frames = frames_by_content([files[k] for k in once], decode())
+    frames = frames_by_content([files[k] for k in once], decode(None))
     warnings.warn(
         f"{files[0].parent}: ignored {len(repeated)} images that repeat the previous one, the "
         f"first is '{names[repeated[0]]}'",
@@ -412,19 +416,10 @@ def _at_steps(names: Sequence[str], num_frames: int, options: ImageOptions) -> N
     return np.array(numbers, dtype=np.int32) * step
 
 
-def _sharpness(
-    frames: Sequence[int], pictures: Iterable[tuple[int, _Image]]
-) -> NDArray[np.float64]:
-    """Variance of the Laplacian of some frames, downscaled to reduce noise."""
-    wanted = set(frames)
-    measured: list[float] = []
-    for index, picture in pictures:
-        if index in wanted:
-            small = grey_within(picture, _SHARPNESS_SIZE)
-            measured.append(float(cv2.Laplacian(small, cv2.CV_32F).var()))
-        if len(measured) == len(frames):
-            break
-    return np.array(measured)
+def _sharpness(pictures: Iterable[tuple[int, _Image]]) -> NDArray[np.float64]:
+    """Variance of the Laplacian of pictures, downscaled to reduce noise."""
+    small = (grey_within(picture, _SHARPNESS_SIZE) for _, picture in pictures)
+    return np.array([float(cv2.Laplacian(grey, cv2.CV_32F).var()) for grey in small])
 
 
 def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:

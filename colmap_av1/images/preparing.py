@@ -23,11 +23,11 @@ from colmap_av1.images.files import (
 )
 from colmap_av1.images.masks import VideoMasks
 from colmap_av1.images.names import names_of_all
-from colmap_av1.images.recognising import check_content, is_turned_back
+from colmap_av1.images.recognising import check_content, frames_near, is_turned_back
 from colmap_av1.images.track_images import (
     TrackedImages,
     choose_from_video,
-    decode_all,
+    decode_pictures,
     track_images,
 )
 from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions, ReadOptions
@@ -179,9 +179,16 @@ def prepare_images(
         kept = zip(names, frames, strict=True)
         first_kept = next(((n, f) for n, f in kept if (folder / n).exists()), None)
         if not existing and first_kept is not None:
-            num_frames = found.tracks.num_frames
-            pictures = decode_all(source, num_frames, options.reading, display, context)
-            check_content([folder / first_kept[0]], [first_kept[1]], pictures)
+            name, frame = first_kept
+            pictures = decode_pictures(
+                source,
+                found.tracks.num_frames,
+                options.reading,
+                display,
+                wanted=frames_near([frame]),
+                context=context,
+            )
+            check_content([folder / name], [frame], pictures)
     return PreparedImages(
         source=source,
         display=display,

@@ -83,6 +83,11 @@ def frames_by_content(
     return np.asarray(found, dtype=np.int32)
 
 
+def frames_near(frames: Iterable[int]) -> set[int]:
+    """The frames that `check_content` compares images with; some may lie outside the video."""
+    return {near for frame in frames for near in range(frame - _REACH, frame + _REACH + 1)}
+
+
 def check_content(
     files: Sequence[Path], frames: Sequence[int], pictures: Iterable[tuple[int, _Image]]
 ) -> None:
@@ -91,7 +96,8 @@ def check_content(
     Args:
         files: image files.
         frames: the frame that each image should show, ascending.
-        pictures: (display index, picture) in order; not read beyond the last needed one.
+        pictures: (display index, picture) of `frames_near` or more frames, in order; not read
+            beyond the last needed one.
 
     Raises:
         ImageError: an image shows something else.

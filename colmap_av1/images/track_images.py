@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -154,23 +154,42 @@ def choose_from_video(
         existing=existing,
         folder=folder,
         times=lambda: times_of_frames(source, tracks.num_frames),
-        decode=lambda: decode_all(source, tracks.num_frames, read, display, context),
+        decode=lambda wanted: decode_pictures(
+            source,
+            tracks.num_frames,
+            read,
+            display,
+            wanted=wanted,
+            context=context,
+        ),
     )
 
 
-def decode_all(
+def decode_pictures(
     source: VideoSource,
     num_frames: int,
     options: ReadOptions,
     display: Display | None,
+    *,
+    wanted: Collection[int] | None,
     context: RunContext,
 ) -> Iterator[tuple[int, _Image]]:
-    """Decode all frames that have tracks, with progress in the stage "recognising"."""
+    """Decode frames that have tracks, with progress in the stage "recognising".
+
+    Args:
+        source: the video.
+        num_frames: number of frames that have tracks.
+        options: how the video is decoded.
+        display: how pictures are cropped and rotated; None: as players do.
+        wanted: indices of the frames to yield; None: all.
+        context: its progress is called.
+    """
     pictures = decodable_frames(
         source.pictures,
-        num_frames,
+        num_frames if wanted is None else min(num_frames, max(wanted) + 1),
         options,
         display,
+        wanted=wanted,
         use="pictures are used",
     )
     for index, picture in pictures:

@@ -186,7 +186,7 @@ def test_invalid_frame_lists_are_refused(
     options = ImageOptions(frame_list=str(tmp_path / "list.txt"))
     with pytest.raises(ImageError, match=message):
         choose_images(
-            still(10), options, existing=(), folder=None, times=lambda: None, decode=lambda: ()
+            still(10), options, existing=(), folder=None, times=lambda: None, decode=lambda _: ()
         )
 
 
