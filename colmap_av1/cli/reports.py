@@ -290,7 +290,7 @@ def info_rows(report: StreamReport) -> Rows:
         references.append(f"hidden {report.hidden_reference_share:.1%}")
     frames = (
         f"{report.num_shown} shown, {report.num_coded} coded, {report.num_hidden} never shown, "
-        f"{report.num_key_frames} intra"
+        f"{report.num_intra_frames} intra"
     )
     if report.num_cut:
         frames += f", {report.num_cut} hidden by an edit list"

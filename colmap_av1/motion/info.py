@@ -52,7 +52,7 @@ class StreamReport:
         num_shown: number of frames that the bitstream shows.
         num_cut: number of these frames that an edit list hides.
         num_hidden: number of coded frames that are never shown.
-        num_key_frames: number of key frames and intra-only frames.
+        num_intra_frames: number of key frames and intra-only frames.
         inter_share: share of inter units in all frames after the first.
         reference_distances: share of references by signed display distance, counted in
             units; negative distances are in the past.
@@ -76,7 +76,7 @@ class StreamReport:
     num_shown: int
     num_cut: int
     num_hidden: int
-    num_key_frames: int
+    num_intra_frames: int
     inter_share: float
     reference_distances: dict[int, float]
     hidden_reference_share: float
@@ -111,7 +111,7 @@ def read_info(
     Examples:
         >>> from colmap_av1 import read_info
         >>> report = read_info("video.mp4")
-        >>> report.num_shown, report.num_key_frames, report.good
+        >>> report.num_shown, report.num_intra_frames, report.good
         (60, 1, True)
     """
     counts = _count(read_motion(video, options), progress)
@@ -165,7 +165,7 @@ def read_info(
         num_shown=structure.num_shown,
         num_cut=structure.num_shown - num_presented,
         num_hidden=counts.num_hidden,
-        num_key_frames=structure.num_key_frames,
+        num_intra_frames=structure.num_intra_frames,
         inter_share=structure.inter_share,
         reference_distances={
             distance: units / references for distance, units in sorted(counts.references.items())
@@ -186,7 +186,7 @@ class Structure:
     Attributes:
         num_coded: number of frames with block data.
         num_shown: number of frames that the bitstream shows.
-        num_key_frames: number of key frames and intra-only frames.
+        num_intra_frames: number of key frames and intra-only frames.
         later_units: number of units in all frames after the first.
         inter_units: number of these units that are inter coded.
         inter_share_of: share of inter units in each shown frame, by its display index.
@@ -194,7 +194,7 @@ class Structure:
 
     num_coded: int = 0
     num_shown: int = 0
-    num_key_frames: int = 0
+    num_intra_frames: int = 0
     later_units: int = 0
     inter_units: int = 0
     inter_share_of: dict[int, float] = field(default_factory=dict)
@@ -208,7 +208,7 @@ class Structure:
         """Count a frame. Frames are given in bitstream order."""
         self.num_coded += 1
         self.num_shown = max(self.num_shown, frame.display_index + 1)
-        self.num_key_frames += frame.header["frame_type"] in (_KEY_FRAME, _INTRA_ONLY_FRAME)
+        self.num_intra_frames += frame.header["frame_type"] in (_KEY_FRAME, _INTRA_ONLY_FRAME)
         inter = (frame.is_inter != 0) & (frame.use_intrabc == 0)
         inter_units = int(np.count_nonzero(inter))
         if frame.display_index >= 0:
@@ -230,9 +230,9 @@ class Structure:
                 f"only {self.inter_share:.0%} of the units after the first frame are inter coded: "
                 "the camera moves too far between frames, or the scene is dynamic"
             )
-        if self.num_shown < _MIN_KEY_FRAME_DISTANCE * (self.num_key_frames - 1):
+        if self.num_shown < _MIN_KEY_FRAME_DISTANCE * (self.num_intra_frames - 1):
             reasons.append(
-                f"a key frame every {self.num_shown / self.num_key_frames:.1f} frames cuts "
+                f"a key frame every {self.num_shown / self.num_intra_frames:.1f} frames cuts "
                 "every track: encode it with -g 9999"
             )
         if bits_per_pixel < _MIN_BITS_PER_PIXEL:

@@ -14,7 +14,7 @@ def test_good_stream_is_reported_as_good(clip: Path) -> None:
     report = read_info(clip)
     assert report.good
     assert (report.width, report.height, report.display.rotation) == (192, 128, 0)
-    assert (report.num_shown, report.num_coded, report.num_key_frames) == (16, 16, 1)
+    assert (report.num_shown, report.num_coded, report.num_intra_frames) == (16, 16, 1)
     assert report.inter_share > 0.6
     assert report.reference_distances[-1] > 0.5
     assert sum(report.reference_distances.values()) == pytest.approx(1)
