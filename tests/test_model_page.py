@@ -162,6 +162,18 @@ def test_page_that_cannot_be_written_is_refused(
     assert not output.exists()
 
 
+@pytest.mark.parametrize("output", [".", "images/..", "../scene"])
+def test_page_of_a_reconstruction_is_next_to_its_folder(
+    output: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "scene" / "images").mkdir(parents=True)
+    (tmp_path / "scene.html").write_text("existing page")
+    monkeypatch.chdir(tmp_path / "scene")
+    words = ["reconstruct", "--video", "none.mp4", "--output", output, "--report"]
+    assert main(words) == 2
+    assert f"{tmp_path / 'scene.html'}: exists" in capsys.readouterr().err
+
+
 def test_points_with_little_parallax_or_without_an_error_have_no_observable_depth() -> None:
     model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_points3D=50))
     for point in model.points3D.values():

@@ -174,8 +174,8 @@ def _reconstruct(namespace: argparse.Namespace) -> None:
     if namespace.report:
         from colmap_av1.view.page import check_page
 
-        output = Path(namespace.output)
-        page = output.with_name(f"{output.resolve().name}.html")
+        output = Path(namespace.output).resolve()  # "." and ".." have no name
+        page = output.parent / f"{output.name}.html"
         check_page(page, overwrite=namespace.overwrite)
     with progress_bars(namespace.quiet) as report:
         result = colmap_av1.reconstruct(
