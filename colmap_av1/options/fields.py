@@ -114,11 +114,13 @@ class Options:
     def __post_init__(self) -> None:
         hints = field_types(type(self))
         for field in dataclasses.fields(cast(Any, self)):
-            hint, value = hints[field.name], getattr(self, field.name)
+            hint = hints[field.name]
+            value = _plain(getattr(self, field.name), hint)
             if not _fits(value, hint, declared_of(field)):
                 wanted = _wanted(value, hint, declared_of(field))
                 found = type(value).__name__ if isinstance(value, Options) else repr(value)
                 raise OptionError(f"{field.name} is {found}: give {wanted}")
+            object.__setattr__(self, field.name, value)
 
 
 def declared_of(field: dataclasses.Field[Any]) -> Declared:
@@ -148,6 +150,19 @@ def members_of(hint: Any) -> tuple[Any, ...]:
 def is_path(members: Collection[Any]) -> bool:
     """Whether any of the types is a path."""
     return any(typing.get_origin(member) is os.PathLike for member in members)
+
+
+def _plain(value: Any, hint: Any) -> Any:
+    """The value, with numbers of other types, such as NumPy's, as int or float.
+
+    Digests and command lines are made from plain numbers only.
+    """
+    for member in members_of(hint):
+        if member in (int, float) and _is_of(value, member):
+            return member(value)
+        if typing.get_origin(member) is tuple and isinstance(value, tuple):
+            return tuple(_plain(v, typing.get_args(member)[0]) for v in value)
+    return value
 
 
 def _fits(value: Any, hint: Any, declared: Declared) -> bool:

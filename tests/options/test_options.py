@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import typing
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,7 +40,9 @@ from colmap_av1.options import (
 )
 from colmap_av1.options.fields import Options, declared_of, field_types, option
 from colmap_av1.options.images import IMAGE_EXTENSIONS
+from colmap_av1.options.words import words_of
 from colmap_av1.tracks.selection import PRESETS
+from colmap_av1.util.digests import digest_of
 from colmap_av1.video.encoders import ENCODERS
 
 KINDS = [
@@ -238,9 +241,16 @@ def test_every_kind_is_exported() -> None:
     assert sorted(colmap_av1.__all__) == colmap_av1.__all__
 
 
-def test_numpy_numbers_and_paths_are_accepted() -> None:
-    assert PairOptions(offsets=(np.int64(3),)).offsets == (3,)
-    assert TrackOptions(cosine=np.float32(0.5), border=3).border == 3
+def test_numpy_numbers_fractions_and_paths_are_accepted() -> None:
+    """Numbers become plain ones, so that options have a digest and a command line."""
+    images = ImageOptions(num_images=np.int64(40))
+    assert type(images.num_images) is int
+    assert digest_of([images]) == digest_of([ImageOptions(num_images=40)])
+    assert words_of(ImageOptions(fps=Fraction(5, 2))) == ["--fps=2.5"]
+    pairs = PairOptions(offsets=(np.int64(3),))
+    assert digest_of([pairs]) == digest_of([PairOptions(offsets=(3,))])
+    tracks = TrackOptions(cosine=np.float32(0.5), border=3)
+    assert digest_of([tracks]) == digest_of([TrackOptions(cosine=0.5, border=3.0)])
     assert ImageOptions(frame_list=Path("a.txt")).frame_list == Path("a.txt")
 
 
