@@ -14,7 +14,7 @@ from typing import Any
 from colmap_av1.cli.terminal import renamed
 from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.cpus import cpu_seconds
-from colmap_av1.util.files import whole_file
+from colmap_av1.util.files import check_creatable, whole_file
 from colmap_av1.util.plain import plain
 
 
@@ -33,6 +33,7 @@ def write_report_json(namespace: argparse.Namespace, report: Any, **others: Any)
         "cpu_seconds": cpu_seconds(),
         **others,
     }
+    Path(namespace.report_json).parent.mkdir(parents=True, exist_ok=True)
     _write(namespace.report_json, facts)
 
 
@@ -41,7 +42,7 @@ def failure_as_json(namespace: argparse.Namespace) -> Iterator[None]:
     """Write the reason if the body fails, if requested.
 
     Raises:
-        OptionError: the file for the report exists and is not a report.
+        OptionError: the file for the report cannot be created, or exists and is not a report.
     """
     path = getattr(namespace, "report_json", None)
     if path is not None:
@@ -59,11 +60,12 @@ def failure_as_json(namespace: argparse.Namespace) -> Iterator[None]:
 
 
 def _check_report(path: Path) -> None:
-    """Refuse to replace a file that is not a report.
+    """Check that a report can be written to a file, which it may create or replace.
 
     Raises:
-        OptionError: it is not.
+        OptionError: the file cannot be created, or exists and is not a report.
     """
+    check_creatable(path)
     if not os.path.lexists(path):
         return
     found: object = None

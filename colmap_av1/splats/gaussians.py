@@ -21,7 +21,7 @@ from colmap_av1.geometry.colmap_model import (
 )
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.distant_points import distance_uncertainty
-from colmap_av1.util.files import check_new_file, whole_file
+from colmap_av1.util.files import check_creatable, check_new_file, whole_file
 from colmap_av1.util.spread import evenly_spread
 
 _Floats = NDArray[np.float64]
@@ -180,9 +180,7 @@ def check_gaussians_path(
     if path.suffix.lower() != ".ply":
         raise OptionError(f"{path}: Gaussians are written as .ply: give a name that ends in .ply")
     check_new_file(path, inputs, overwrite=overwrite)
-    above = next(p for p in path.absolute().parents if p.exists())
-    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        raise OptionError(f"{path}: cannot be written: give another file")
+    check_creatable(path)
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:

@@ -89,10 +89,18 @@ def check_new_folder(
                 f"{path}: contains {other}, which is never replaced: give a new folder"
             )
     check_apart(path, inputs)
-    path = path.resolve()
-    above = next(folder for folder in path.parents if folder.exists())
+    check_creatable(path.resolve())
+
+
+def check_creatable(path: Path) -> None:
+    """Check that a file or folder can be created, with the folders above it.
+
+    Raises:
+        OptionError: it cannot be created.
+    """
+    above = next(folder for folder in path.absolute().parents if folder.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        raise OptionError(f"{path}: cannot be created in {above}: give another folder")
+        raise OptionError(f"{path}: cannot be created in {above}: give another path")
 
 
 def check_apart(output: Path, inputs: Iterable[_Path | None]) -> None:

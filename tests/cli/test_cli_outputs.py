@@ -115,10 +115,21 @@ def test_reports_only_replace_reports(
     (line,) = capsys.readouterr().err.splitlines()
     assert report in line
     assert contents(work) == before
-    assert main(["info", "--video", "v.mp4", "--report_json", "none/r.json"]) == 2
-    assert "none/r.json: cannot be written" in capsys.readouterr().err
     for status, again in ((2, "none.mp4"), (0, "v.mp4"), (0, "v.mp4")):
         assert main(["info", "--video", again, "--report_json", "r.json", "--quiet"]) == status
+    assert main(["info", "--video", "v.mp4", "--report_json", "new/r.json", "--quiet"]) == 0
+    assert (work / "new/r.json").exists()
+
+
+@pytest.mark.parametrize("report", ["notes.log/r.json", "closed/new/r.json"])
+def test_reports_that_cannot_be_created_are_refused_before_the_work(
+    report: str, work: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (work / "closed").mkdir(mode=0o500)
+    if report.startswith("closed") and os.access(work / "closed", os.W_OK):
+        pytest.skip("root may write to all folders")
+    assert main(["info", "--video", "none.mp4", "--report_json", report]) == 2
+    assert f"{report}: cannot be created" in capsys.readouterr().err
 
 
 AGAIN = [

@@ -131,7 +131,7 @@ def test_unusable_output_paths_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="not a file"):
         check_gaussians_path(tmp_path / "folder.ply", [])
     (tmp_path / "file").touch()
-    with pytest.raises(OptionError, match="written"):
+    with pytest.raises(OptionError, match="cannot be created"):
         check_gaussians_path(tmp_path / "file" / "init.ply", [])
     empty = Gaussians(*(np.empty((0, k)) for k in (3, 3, 3, 4)), np.empty(0), np.empty((0, 3)))
     with pytest.raises(ModelError, match="cannot be written"):
