@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_of_videos
 from colmap_av1.database.reading import DatabaseImage, read_images
-from colmap_av1.database.writing import write_matched_images, write_matches
+from colmap_av1.database.writing import check_writable, write_matched_images
 from colmap_av1.errors import DatabaseError, ModelError, OptionError, VideoError
 from colmap_av1.geometry.cameras import check_pixel_aspect, focal_length_warning
 from colmap_av1.images.files import alone_in, files_in
@@ -61,7 +61,6 @@ from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
 
-_NO_PAIRS = np.empty((0, 2), dtype=np.int32)
 _LENGTH_QUANTILES = (0.0, 0.25, 0.5, 0.75, 0.9, 1.0)
 
 
@@ -663,6 +662,7 @@ def _path_word(path: Path) -> str:
 
 def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseImage]:
     """Read the images of the database, and check that it can be written."""
+    check_writable(database)
     listed = read_images(database)
     filled = next((i for i in listed if i.num_keypoints or i.num_matches), None)
     if filled is not None and options.on_existing == "error":
@@ -672,13 +672,6 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
         )
     if listed:
         check_no_camera(database, options.camera)
-    if database.exists() and database.stat().st_size:
-        # Writes nothing, but fails if the database is locked.
-        write_matches(database, (), (), (), pairs=_NO_PAIRS, matches=(), geometries=())
-    elif not os.access(database.resolve().parent, os.W_OK | os.X_OK):
-        raise DatabaseError(
-            f"{database}: no permission to write a database there: give another path"
-        )
     return listed
 
 

@@ -63,26 +63,17 @@ def _target(path: Path) -> Path:
         raise DatabaseError(f"{path} is a broken link: give another path") from error
 
 
-def open_database(path: Path) -> contextlib.AbstractContextManager[sqlite3.Connection]:
-    """Context manager that opens an existing COLMAP database and closes it on exit.
+@contextlib.contextmanager
+def open_unaltered(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open an existing COLMAP database for reading, without changing the file or its folder.
 
     Raises:
         DatabaseError: the file is not a COLMAP database or is damaged, or SQLite fails in the body
             of the `with` statement.
     """
-    return _open_checked(path, "mode=rw")
-
-
-def open_unaltered(path: Path) -> contextlib.AbstractContextManager[sqlite3.Connection]:
-    """Like `open_database`, for reading without changing the file or its folder."""
     # Without a journal the file is complete, so SQLite can read it without a lock file.
     busy = any(log.exists() and log.stat().st_size > 0 for log in _logs(_target(path)))
-    return _open_checked(path, "mode=ro" if busy else "mode=ro&immutable=1")
-
-
-@contextlib.contextmanager
-def _open_checked(path: Path, how: str) -> Iterator[sqlite3.Connection]:
-    with _connect(path, how, path) as connection:
+    with _connect(path, "mode=ro" if busy else "mode=ro&immutable=1", path) as connection:
         check_layout(connection, path)
         yield connection
 

@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.database.file import is_new, open_database, open_unaltered
+from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.layout import MAX_NUM_IMAGES, columns
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.cameras import camera_fault
@@ -67,12 +67,12 @@ def read_images(database: str | os.PathLike[str]) -> list[DatabaseImage]:
         The images; an empty list if the file is absent or empty.
 
     Raises:
-        DatabaseError: the file is locked, unreadable, or not a COLMAP database.
+        DatabaseError: the file is being written, unreadable, or not a COLMAP database.
     """
     path = Path(database)
     if is_new(path):
         return []
-    with open_database(path) as connection:
+    with open_unaltered(path) as connection:
         rows = connection.execute(
             "SELECT image_id, name, camera_id, COALESCE(width, 0), COALESCE(height, 0), "
             "COALESCE(keypoints.rows, 0) FROM images LEFT JOIN cameras USING (camera_id) "
@@ -99,13 +99,13 @@ def read_cameras(database: str | os.PathLike[str]) -> dict[int, pycolmap.Camera]
     """Read the cameras of a database, by id.
 
     Raises:
-        DatabaseError: the file is locked, unreadable, or not a COLMAP database, or has a camera
-            with invalid parameters or of a model that the installed pycolmap does not know.
+        DatabaseError: the file is being written, unreadable, or not a COLMAP database, or has a
+            camera with invalid parameters or of a model that the installed pycolmap does not know.
     """
     path = Path(database)
     if is_new(path):
         return {}
-    with open_database(path) as connection:
+    with open_unaltered(path) as connection:
         cameras = cameras_of(connection, path)
     for camera_id, camera in cameras.items():
         fault = camera_fault(camera)

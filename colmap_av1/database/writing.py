@@ -154,6 +154,27 @@ def write_matches(
         write_existing(path, fill)
 
 
+def check_writable(database: str | os.PathLike[str]) -> None:
+    """Check that a database can be written or created, without changing its content.
+
+    Like every opening for writing, this rolls back an interrupted write.
+
+    Raises:
+        DatabaseError: the file is locked, not a COLMAP database, or has rigs or frames but no
+            images; or its folder does not exist or cannot be written.
+    """
+    path = Path(database)
+    new = is_new(path)
+    if not os.access(path.resolve().parent, os.W_OK | os.X_OK):
+        raise DatabaseError(f"{path}: no permission to write a database there: give another path")
+
+    def fill(connection: sqlite3.Connection) -> None:
+        _place_images(connection, path, (), None, "error")
+
+    if not new:
+        write_existing(path, fill)
+
+
 def _place_images(
     connection: sqlite3.Connection,
     path: Path,
