@@ -35,7 +35,7 @@ from colmap_av1.geometry.colmap_model import no_points, write_model
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import count_through
-from colmap_av1.images.inputs import labels_of
+from colmap_av1.images.inputs import labels_of, read_inputs
 from colmap_av1.match import match
 from colmap_av1.options import (
     CameraOptions,
@@ -289,6 +289,15 @@ def test_labels_of_videos_differ(places: list[str], labels: list[str]) -> None:
 def test_names_that_differ_only_in_special_characters_are_an_error() -> None:
     with pytest.raises(OptionError, match="rename"):
         labels_of(["/x/a b", "/x/a-b", "/x/a+b"])
+
+
+def test_names_that_are_too_long_for_outputs_are_an_error(clip: Path, tmp_path: Path) -> None:
+    videos = [shutil.copyfile(clip, tmp_path / f"{'x' * 212}{i}.mp4") for i in range(2)]
+    with videos[1].open("ab") as file:
+        file.write(b"\0\0\0\x08free")
+    assert read_inputs(videos[0], None, MatchOptions()).labels == ("",)
+    with pytest.raises(OptionError, match="too long"):
+        read_inputs(videos, None, MatchOptions())
 
 
 @given(st.lists(st.text(min_size=1, max_size=4), min_size=1, max_size=4))

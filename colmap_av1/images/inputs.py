@@ -19,6 +19,7 @@ from colmap_av1.images.masks import Masks, VideoMasks, read_masks
 from colmap_av1.images.photos import Photo, photo_files, read_photos
 from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.util.digests import file_digest
+from colmap_av1.util.files import LONGEST_NAME
 from colmap_av1.video.facts import Video, count_shown, read_video
 from colmap_av1.video.metadata.lens import implausible_focal_length
 from colmap_av1.video.metadata.positions import implausible_position
@@ -163,6 +164,7 @@ def read_inputs(
     found = read_photos(folder, files, labels[-1], flat=flat) if folder is not None else []
     _check_one_camera(videos, found, options.camera)
     of_videos = tuple(labels[: len(videos)]) if len(videos) > 1 else ("",)
+    _check_lengths(videos, of_videos)
     hints = [words for v in videos for words in hint(v.path, v.projection, v.picture_size)]
     doubtful = [
         (v.doubtful_times, implausible_position(v.tags), implausible_focal_length(v.tags))
@@ -242,6 +244,13 @@ def _check_rates(videos: Sequence[Video], options: CameraOptions) -> None:
             f"rolling_shutter is {shutter} milliseconds, but the frame rate of {unknown} is "
             "unknown: leave it out, or give a copy of the video with a frame rate"
         )
+
+
+def _check_lengths(videos: Sequence[Video], labels: Sequence[str]) -> None:
+    """Reject names that are too long for files such as tracks_NAME.json."""
+    for video, label in zip(videos, labels, strict=True):
+        if len(os.fsencode(f"tracks_{label}.json")) > LONGEST_NAME:
+            raise OptionError(f"{video}: its name is too long for names of outputs: rename it")
 
 
 def _are_same(a: Video, b: Video) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
 from colmap_av1.options.images import ImageOptions, check_extension, check_image_pattern
+from colmap_av1.util.files import LONGEST_NAME
 from colmap_av1.util.texts import check_name
 
 _MOST_DIGITS = 255
@@ -159,10 +161,11 @@ def check_new_name(name: str) -> None:
 
     Raises:
         OptionError: the extension is not that of a format that can be written.
-        ImageError: the name leaves the image folder.
+        ImageError: the name leaves the image folder, or is too long.
     """
     check_extension(name)
-    image_file(Path(), name)
+    if len(os.fsencode(image_file(Path(), name).name)) > LONGEST_NAME:
+        raise ImageError(f"image {name!r} has a name that is too long: give another name")
 
 
 def image_file(root: Path, name: str) -> Path:

@@ -10,12 +10,12 @@ from typing import ClassVar, Literal
 
 from colmap_av1.errors import OptionError
 from colmap_av1.options.fields import Options, option
+from colmap_av1.util.files import LONGEST_NAME
 
 # Formats in which images are written.
 IMAGE_EXTENSIONS = (".png", ".jpg", ".jpeg")
 _NUMBER_FIELD = re.compile(r"%0?\d*d")
 _LONGEST_NUMBER = 20  # digits
-_LONGEST_NAME = 255  # bytes, on all usual file systems
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def check_image_pattern(pattern: str) -> str:
         )
     # Checked before the pattern is used, because formatting a huge field width fills the memory.
     too_long = int(fields[0].strip("%d") or 0) > _LONGEST_NUMBER if len(fields[0]) < 9 else True
-    if too_long or len(os.fsencode(pattern)) + _LONGEST_NUMBER > _LONGEST_NAME or "\0" in pattern:
+    if too_long or len(os.fsencode(pattern)) + _LONGEST_NUMBER > LONGEST_NAME or "\0" in pattern:
         raise OptionError(
             f"image_name {pattern[:40]!r} gives invalid file names: give one such as frame_%06d.png"
         )

@@ -319,7 +319,13 @@ def test_read_only_folder_of_images_is_used(
 
 
 @pytest.mark.parametrize(
-    ("name", "error"), [("../a.png", ImageError), ("/a.png", ImageError), ("a.tif", OptionError)]
+    ("name", "error"),
+    [
+        ("../a.png", ImageError),
+        ("/a.png", ImageError),
+        ("a.tif", OptionError),
+        (f"{'a' * 220}.png", ImageError),
+    ],
 )
 def test_unwritable_image_names_are_refused(
     clip: Path, tmp_path: Path, name: str, error: type[Exception]

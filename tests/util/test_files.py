@@ -14,6 +14,7 @@ from killed_runs import kill_while_replacing, kill_while_writing
 
 from colmap_av1.errors import OptionError
 from colmap_av1.util.files import (
+    LONGEST_NAME,
     check_apart,
     check_new_file,
     check_new_folder,
@@ -49,6 +50,16 @@ def test_existing_files_are_refused_without_overwrite(folder: Path) -> None:
     for output in ("images", os.devnull):
         with pytest.raises(OptionError, match="is not a file"):
             check_new_file(Path(output), overwrite=True)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have other limits")
+def test_hidden_file_of_the_longest_name_is_created(tmp_path: Path) -> None:
+    longest = "x" * LONGEST_NAME
+    with whole_file(tmp_path / longest):
+        pass
+    assert names_in(tmp_path) == [longest]
+    with pytest.raises(OSError, match="too long"), whole_file(tmp_path / f"{longest}x"):
+        pass
 
 
 @pytest.mark.parametrize("output", ["video.mp4", "images/../video.mp4", "link", "hard"])
