@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_of_videos
 from colmap_av1.database.reading import DatabaseImage, read_images
-from colmap_av1.database.writing import check_writable, write_matched_images
+from colmap_av1.database.writing import check_writable, write_matches
 from colmap_av1.errors import DatabaseError, ModelError, OptionError, VideoError
 from colmap_av1.geometry.cameras import check_pixel_aspect, focal_length_warning
 from colmap_av1.images.files import alone_in, files_in
@@ -305,7 +305,7 @@ def match(
 
     with clock.measure("database"):
         positions = image_positions(images.image_set, inputs.videos, inputs.photos)
-        write_matched_images(
+        write_matches(
             database,
             names,
             None if listed else found.cameras,

@@ -40,39 +40,13 @@ _POSE_PRIORS = (
 _UNKNOWN = np.full(9, np.nan, dtype="<f8")
 
 
-def write_matched_images(
+def write_matches(
     database: str | os.PathLike[str],
     names: Sequence[str],
     cameras: pycolmap.Camera | Sequence[pycolmap.Camera] | None,
     matched: MatchedImages,
     on_existing: OnExisting = "error",
     *,
-    places: NDArray[np.float64] | None = None,
-) -> None:
-    """Write matched images with their keypoints, matches and geometries, see `write_matches`."""
-    write_matches(
-        database,
-        names,
-        cameras,
-        matched.keypoints,
-        pairs=matched.pairs,
-        matches=matched.matches,
-        geometries=matched.geometries,
-        on_existing=on_existing,
-        places=places,
-    )
-
-
-def write_matches(
-    database: str | os.PathLike[str],
-    names: Sequence[str],
-    cameras: pycolmap.Camera | Sequence[pycolmap.Camera] | None,
-    keypoints: Sequence[ImageKeypoints],
-    *,
-    pairs: NDArray[np.int32],
-    matches: Sequence[NDArray[np.uint32]],
-    geometries: Sequence[TwoViewGeometry],
-    on_existing: OnExisting = "error",
     places: NDArray[np.float64] | None = None,
 ) -> None:
     """Write keypoints, matches and two-view geometries: all rows, or none.
@@ -101,10 +75,7 @@ def write_matches(
         names: name of each image, its path relative to the image folder.
         cameras: the camera of all inserted images, or one for each image, where images may share
             the same object; may be None if the database lists the images.
-        keypoints: keypoints of each image.
-        pairs: int32 [m, 2] indices of images.
-        matches: for each pair, uint32 [n, 2] indices of matching keypoints.
-        geometries: the verified geometry of each pair.
+        matched: the keypoints of the images, and the matches and geometries of their pairs.
         on_existing: what happens to existing keypoints and matches of the images.
         places: float64 [num_images, 3] latitude and longitude in degrees and altitude in metres of
             each image, NaN where unknown. They become pose priors of images that have none. None:
@@ -117,6 +88,8 @@ def write_matches(
             unchanged.
     """
     path = Path(database)
+    keypoints, pairs = matched.keypoints, matched.pairs
+    matches, geometries = matched.matches, matched.geometries
     if not (len(names) == len(keypoints) and len(pairs) == len(matches) == len(geometries)):
         raise ValueError("give one name for each image, and matches and geometry for each pair")
     if len(set(names)) != len(names) or "" in names:
@@ -143,8 +116,7 @@ def write_matches(
             matches=matches,
             geometries=geometries,
         )
-        if names:
-            _complete_frames(connection, path)
+        _complete_frames(connection, path)
         if places is not None:
             _write_places(connection, image_ids, places)
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 from numpy.typing import NDArray
 
-from colmap_av1.database.writing import write_matched_images
+from colmap_av1.database.writing import write_matches
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.depth import DepthEvidence
@@ -120,7 +120,7 @@ def match_stage(
         found = _match_images(run, videos, image_set, index)
         cameras, matched = found.cameras, found.matched
         with clock.measure("database"):
-            write_matched_images(
+            write_matches(
                 partial / "database.db",
                 keyed.images.names,
                 cameras,

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 
-from colmap_av1.database.writing import write_matched_images
+from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.cameras import with_initial_intrinsics
 from colmap_av1.geometry.colmap_model import read_model
@@ -182,7 +182,7 @@ def _map_tracks(
     matched = verify_images(paired, cameras, options.match.verify, run.context)
     with tempfile.TemporaryDirectory() as folder:
         database, models = Path(folder) / "database.db", Path(folder) / "models"
-        write_matched_images(database, [i.name for i in known.images], cameras, matched)
+        write_matches(database, [i.name for i in known.images], cameras, matched)
         keep_start_tracks(database)
         try:
             sizes = map_poses(

@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.database.writing import write_matched_images
+from colmap_av1.database.writing import write_matches
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pairs import PreparedStart, are_far, with_demoted
 from colmap_av1.matching.mapper_limits import RELAXED_LIMITS
@@ -81,7 +81,7 @@ def demote_failing_starts(
     def failing_start(matched: MatchedImages) -> list[str] | None:
         with tempfile.TemporaryDirectory() as folder:
             database, log = Path(folder) / "matches.db", Path(folder) / "log"
-            write_matched_images(database, names, known, matched)
+            write_matches(database, names, known, matched)
             return start_mapper(database, options, num_images, log=log, initial_pair=initial_pair)
 
     with context.clock.measure("verification"):

@@ -31,6 +31,7 @@ from colmap_av1.database.reading import pair_id_from_image_ids
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.cameras import make_camera
+from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.options import CameraOptions
 
 
@@ -51,20 +52,20 @@ def maps(path: Path) -> bool:
 
 def test_report_of_a_new_database(tmp_path: Path) -> None:
     path = tmp_path / "new.db"
-    write_matches(path, NAMES, CAMERA, **OURS)
+    write_matches(path, NAMES, CAMERA, OURS)
     report = check_database(path)
     assert (report.layout, report.readers) == ("3.8 or 3.9", "3.8 and later")
     assert report.user_version == 3800
     assert report.num_images == report.num_connected_images == NUM_IMAGES
     assert report.image_sizes == {(WIDTH, HEIGHT): NUM_IMAGES}
     assert (report.num_cameras, report.num_priors) == (1, 1)
-    assert report.num_keypoints == sum(len(k.xy) for k in OURS["keypoints"])
+    assert report.num_keypoints == sum(len(k.xy) for k in OURS.keypoints)
     assert 0.95 < report.num_matched_keypoints / report.num_keypoints <= 1
     assert report.keypoint_columns == {2: NUM_IMAGES}
     assert report.num_described_images == 0
-    assert report.num_pairs == report.num_used_pairs == len(OURS["pairs"])
-    assert report.num_inliers == sum(len(g.inlier_matches) for g in OURS["geometries"])
-    assert report.configs == {"CALIBRATED": len(OURS["pairs"])}
+    assert report.num_pairs == report.num_used_pairs == len(OURS.pairs)
+    assert report.num_inliers == sum(len(g.inlier_matches) for g in OURS.geometries)
+    assert report.configs == {"CALIBRATED": len(OURS.pairs)}
     assert report.parallax is not None
     # The camera moves 40 degrees around the scene, which only the first and last image span.
     assert 25 < report.parallax.angle < 40
@@ -88,7 +89,7 @@ def test_report_of_a_sift_database(tmp_path: Path, layout: str) -> None:
     assert (report.layout, report.readers) == expected[layout]
     assert report.keypoint_columns == {6: NUM_IMAGES}
     assert report.num_described_images == NUM_IMAGES
-    assert report.num_used_pairs == len(THEIRS["pairs"])
+    assert report.num_used_pairs == len(THEIRS.pairs)
     assert report.mappable
     assert {severity for severity, _ in found(report)} == {"note"}
     assert any("order of names" in text for _, text in found(report))
@@ -286,7 +287,7 @@ def test_changed_database_gives_the_finding(
 )
 def test_little_parallax_is_reported(tmp_path: Path, arc: float, severity: str) -> None:
     scene = make_scene(num_frames=NUM_IMAGES, num_points=500, noise=0.05, arc_degrees=arc)
-    write_matches(tmp_path / "a.db", NAMES, CAMERA, **match_scene(scene, CAMERA))
+    write_matches(tmp_path / "a.db", NAMES, CAMERA, match_scene(scene, CAMERA))
     report = check_database(tmp_path / "a.db")
     assert any(kind == severity and "parallax" in text for kind, text in found(report))
     assert report.parallax is not None
@@ -296,11 +297,11 @@ def test_little_parallax_is_reported(tmp_path: Path, arc: float, severity: str) 
 def test_pairs_of_a_calibrated_rig_are_used(tmp_path: Path) -> None:
     """Their pose comes from the essential matrix, as for calibrated pairs."""
     path = tmp_path / "a.db"
-    write_matches(path, NAMES, CAMERA, **OURS)
+    write_matches(path, NAMES, CAMERA, OURS)
     before = check_database(path)
     alter(path, "UPDATE two_view_geometries SET config = 9")
     report = check_database(path)
-    assert report.configs == {"CALIBRATED_RIG": len(OURS["pairs"])}
+    assert report.configs == {"CALIBRATED_RIG": len(OURS.pairs)}
     assert report.num_used_pairs == before.num_used_pairs
     assert report.parallax is not None
     assert report.parallax.angle == pytest.approx(before.parallax.angle)
@@ -309,7 +310,7 @@ def test_pairs_of_a_calibrated_rig_are_used(tmp_path: Path) -> None:
 def test_assumed_focal_length_is_reported(tmp_path: Path) -> None:
     guess = make_camera(CameraOptions(), WIDTH, HEIGHT)
     scene = make_scene(num_frames=NUM_IMAGES, num_points=500)
-    write_matches(tmp_path / "a.db", NAMES, guess, **match_scene(scene, guess))
+    write_matches(tmp_path / "a.db", NAMES, guess, match_scene(scene, guess))
     report = check_database(tmp_path / "a.db")
     assert report.configs.keys() == {"UNCALIBRATED"}
     assert report.parallax is not None
@@ -337,7 +338,7 @@ def test_forward_motion_is_reported(tmp_path: Path) -> None:
         confirmed=np.zeros(num * NUM_IMAGES, dtype=np.bool_),
     )
     drive = dataclasses.replace(scene, tracks=tracks)
-    write_matches(tmp_path / "a.db", NAMES, CAMERA, **match_scene(drive, CAMERA))
+    write_matches(tmp_path / "a.db", NAMES, CAMERA, match_scene(drive, CAMERA))
     texts = [text for _, text in found(check_database(tmp_path / "a.db"))]
     assert any("axis" in text for text in texts)
 
@@ -440,7 +441,7 @@ def test_check_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
 def test_large_image_ids_are_read(tmp_path: Path) -> None:
     """The ids are near the limit of COLMAP's pair ids."""
     path = tmp_path / "a.db"
-    write_matches(path, NAMES[:2], CAMERA, **two_images())
+    write_matches(path, NAMES[:2], CAMERA, two_images())
     big = 2147483646
     for table in ("images", "keypoints"):
         alter(path, f"UPDATE {table} SET image_id = ? WHERE image_id = 2", big)
@@ -449,11 +450,12 @@ def test_large_image_ids_are_read(tmp_path: Path) -> None:
     assert check_database(path).num_used_pairs == 1
 
 
-def two_images() -> dict[str, object]:
-    (index,) = [k for k, pair in enumerate(OURS["pairs"].tolist()) if pair == [0, 1]]
-    return {
-        "keypoints": OURS["keypoints"][:2],
-        "pairs": OURS["pairs"][[index]],
-        "matches": [OURS["matches"][index]],
-        "geometries": [OURS["geometries"][index]],
-    }
+def two_images() -> MatchedImages:
+    (index,) = [k for k, pair in enumerate(OURS.pairs.tolist()) if pair == [0, 1]]
+    return dataclasses.replace(
+        OURS,
+        keypoints=OURS.keypoints[:2],
+        pairs=OURS.pairs[[index]],
+        matches=[OURS.matches[index]],
+        geometries=[OURS.geometries[index]],
+    )

@@ -28,6 +28,7 @@ from colmap_av1.database.reading import read_cameras, read_images
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import ColmapAv1Error
 from colmap_av1.interop.hloc import export_hloc
+from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.view import view_database
@@ -86,7 +87,7 @@ SCHEMA_CHANGES = st.sampled_from(
 )
 
 
-def new_rows(seed: int) -> dict[str, Any]:
+def new_rows(seed: int) -> MatchedImages:
     """Keypoints, matches and geometries of the three images."""
     rng = np.random.default_rng(seed)
     keypoints = [
@@ -102,12 +103,10 @@ def new_rows(seed: int) -> dict[str, Any]:
         config=TwoViewConfig.CALIBRATED, inlier_matches=matches, E=rng.normal(size=(3, 3))
     )
     pairs = np.array([[0, 1], [0, 2], [1, 2]], dtype=np.int32)
-    return {
-        "keypoints": keypoints,
-        "pairs": pairs,
-        "matches": [matches] * len(pairs),
-        "geometries": [geometry] * len(pairs),
-    }
+    each = len(pairs)
+    return MatchedImages(
+        keypoints, pairs, [matches] * each, [geometry] * each, forward_motion=False
+    )
 
 
 class Databases(RuleBasedStateMachine):
@@ -144,14 +143,14 @@ class Databases(RuleBasedStateMachine):
         make_layout(self.path, layout)
         query(self.path, "PRAGMA journal_mode = DELETE")
         if fills:
-            write_matches(self.path, NAMES, CAMERA, **new_rows(0))
+            write_matches(self.path, NAMES, CAMERA, new_rows(0))
 
     @rule(mode=st.sampled_from(["error", "append", "replace"]))
     def write(self, mode: Any) -> None:
         self.seed += 1
         rows = new_rows(self.seed)
         self.attempt(
-            lambda: write_matches(self.path, NAMES, CAMERA, **rows, on_existing=mode), writes=True
+            lambda: write_matches(self.path, NAMES, CAMERA, rows, on_existing=mode), writes=True
         )
 
     @rule(where=st.sampled_from(COLUMNS), value=VALUES, which=st.integers(0, 2))

@@ -11,6 +11,7 @@ import tempfile
 import textwrap
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,13 +38,14 @@ from colmap_av1.database.reading import (
 from colmap_av1.database.writing import check_writable, write_matches
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.cameras import make_camera
+from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import CameraOptions
 
 SCENE = make_scene()
 NAMES = [f"frame_{i:03d}.png" for i in range(SCENE.tracks.num_frames)]
-ROWS: dict[str, Any] = match_scene(SCENE, CAMERA)
+ROWS = match_scene(SCENE, CAMERA)
 
 
 def dump(database: Path) -> list[str]:
@@ -91,14 +93,14 @@ def check_mapper_command(database: Path, folder: Path) -> None:
 
 def test_incremental_mapper_maps_a_new_database(tmp_path: Path) -> None:
     database = tmp_path / "new.db"
-    write_matches(database, NAMES, CAMERA, **ROWS)
+    write_matches(database, NAMES, CAMERA, ROWS)
     assert [p.name for p in tmp_path.iterdir()] == ["new.db"]
     check_incremental_mapper(database, tmp_path)
 
 
 def test_global_mapper_maps_a_new_database(tmp_path: Path) -> None:
     database = tmp_path / "new.db"
-    write_matches(database, NAMES, CAMERA, **ROWS)
+    write_matches(database, NAMES, CAMERA, ROWS)
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
     models = pycolmap.global_mapping(database, tmp_path, tmp_path / "model", options)
@@ -107,14 +109,14 @@ def test_global_mapper_maps_a_new_database(tmp_path: Path) -> None:
 
 @needs_colmap
 def test_colmap_command_maps_a_new_database(tmp_path: Path) -> None:
-    write_matches(tmp_path / "new.db", NAMES, CAMERA, **ROWS)
+    write_matches(tmp_path / "new.db", NAMES, CAMERA, ROWS)
     check_mapper_command(tmp_path / "new.db", tmp_path)
 
 
 @needs_colmap
 def test_new_database_has_the_schema_of_colmap_3_8(tmp_path: Path) -> None:
     colmap("database_creator", "--database_path", tmp_path / "colmap.db")
-    write_matches(tmp_path / "ours.db", NAMES, CAMERA, **ROWS)
+    write_matches(tmp_path / "ours.db", NAMES, CAMERA, ROWS)
     version = query(tmp_path / "colmap.db", "PRAGMA user_version")[0][0]
     if version // 100 != 38:
         pytest.skip(f"the colmap command is not 3.8 but {version}")
@@ -131,7 +133,7 @@ def test_new_database_has_the_schema_of_colmap_3_8(tmp_path: Path) -> None:
 
 
 def test_pycolmap_reads_the_written_rows(tmp_path: Path) -> None:
-    write_matches(tmp_path / "new.db", NAMES, CAMERA, **ROWS)
+    write_matches(tmp_path / "new.db", NAMES, CAMERA, ROWS)
     with pycolmap.Database.open(tmp_path / "new.db") as database:
         assert database.num_cameras() == 1
         camera = database.read_camera(1)
@@ -141,9 +143,9 @@ def test_pycolmap_reads_the_written_rows(tmp_path: Path) -> None:
             image = database.read_image_with_name(name)
             assert image.image_id == i + 1
             keypoints = database.read_keypoints(image.image_id)
-            assert np.array_equal(np.asarray(keypoints)[:, :2], ROWS["keypoints"][i].xy)
+            assert np.array_equal(np.asarray(keypoints)[:, :2], ROWS.keypoints[i].xy)
         for (i, j), matches, geometry in zip(
-            ROWS["pairs"], ROWS["matches"], ROWS["geometries"], strict=True
+            ROWS.pairs, ROWS.matches, ROWS.geometries, strict=True
         ):
             assert np.array_equal(database.read_matches(i + 1, j + 1), matches)
             stored = database.read_two_view_geometry(i + 1, j + 1)
@@ -169,18 +171,18 @@ def test_existing_images_keep_their_ids(tmp_path: Path) -> None:
         for name in reversed(NAMES):
             database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
     before = query(path, "SELECT * FROM images")
-    write_matches(path, NAMES, None, **ROWS)
+    write_matches(path, NAMES, None, ROWS)
     assert query(path, "SELECT * FROM images") == before
     existing = {image.name: image for image in read_images(path)}
     assert existing[NAMES[0]].image_id == len(NAMES)
-    assert existing[NAMES[0]].num_keypoints == len(ROWS["keypoints"][0].xy)
+    assert existing[NAMES[0]].num_keypoints == len(ROWS.keypoints[0].xy)
     assert existing[NAMES[0]].num_matches == sum(
-        len(m) for m, (i, _) in zip(ROWS["matches"], ROWS["pairs"], strict=True) if i == 0
+        len(m) for m, (i, _) in zip(ROWS.matches, ROWS.pairs, strict=True) if i == 0
     )
     # If the larger id is given first, COLMAP inverts the stored geometry.
-    index = next(k for k, g in enumerate(ROWS["geometries"]) if g.qvec is not None)
-    i, j = ROWS["pairs"][index]
-    geometry = ROWS["geometries"][index]
+    index = next(k for k, g in enumerate(ROWS.geometries) if g.qvec is not None)
+    i, j = ROWS.pairs[index]
+    geometry = ROWS.geometries[index]
     with pycolmap.Database.open(path) as database:
         a, b = existing[NAMES[i]].image_id, existing[NAMES[j]].image_id
         assert a > b
@@ -200,7 +202,7 @@ def test_images_imported_by_pycolmap_keep_their_rigs_and_are_mapped(tmp_path: Pa
     pycolmap.import_images(path, images, pycolmap.CameraMode.SINGLE)
     assert len(read_images(path)) == len(NAMES)
     rigs = query(path, "SELECT * FROM rigs"), query(path, "SELECT * FROM frames")
-    write_matches(path, NAMES, None, **ROWS)
+    write_matches(path, NAMES, None, ROWS)
     assert (query(path, "SELECT * FROM rigs"), query(path, "SELECT * FROM frames")) == rigs
     check_incremental_mapper(path, tmp_path)
 
@@ -208,7 +210,7 @@ def test_images_imported_by_pycolmap_keep_their_rigs_and_are_mapped(tmp_path: Pa
 def test_matches_in_an_empty_database_of_pycolmap_are_mapped(tmp_path: Path) -> None:
     path = tmp_path / "empty.db"
     pycolmap.Database.open(path).close()
-    write_matches(path, NAMES, CAMERA, **ROWS)
+    write_matches(path, NAMES, CAMERA, ROWS)
     assert query(path, "SELECT COUNT(*) FROM frames") == [(0,)]
     check_incremental_mapper(path, tmp_path)
 
@@ -228,7 +230,7 @@ def test_empty_rows_of_the_colmap_matcher_are_replaced(tmp_path: Path) -> None:
     colmap("exhaustive_matcher", "--database_path", path, "--SiftMatching.use_gpu", 0)
     assert query(path, "SELECT COUNT(*), MAX(rows) FROM matches")[0] == (120, 0)
     assert {i.num_keypoints for i in read_images(path)} == {0}
-    write_matches(path, NAMES, None, **ROWS)
+    write_matches(path, NAMES, None, ROWS)
     assert query(path, "SELECT COUNT(*) FROM matches") == [(120,)]
     assert query(path, "PRAGMA user_version") == [(3800,)]
     check_mapper_command(path, tmp_path)
@@ -236,7 +238,7 @@ def test_empty_rows_of_the_colmap_matcher_are_replaced(tmp_path: Path) -> None:
 
 def test_each_image_can_have_its_own_camera(tmp_path: Path) -> None:
     cameras = [make_camera(CameraOptions(), WIDTH, HEIGHT + i) for i in range(len(NAMES))]
-    write_matches(tmp_path / "new.db", NAMES, cameras, **ROWS)
+    write_matches(tmp_path / "new.db", NAMES, cameras, ROWS)
     images = read_images(tmp_path / "new.db")
     stored = read_cameras(tmp_path / "new.db")
     assert [stored[image.camera_id].height for image in images] == [c.height for c in cameras]
@@ -245,7 +247,7 @@ def test_each_image_can_have_its_own_camera(tmp_path: Path) -> None:
 
 def test_same_rows_give_identical_files(tmp_path: Path) -> None:
     for name in ("a.db", "b.db"):
-        write_matches(tmp_path / name, NAMES, CAMERA, **ROWS)
+        write_matches(tmp_path / name, NAMES, CAMERA, ROWS)
     digests = {hashlib.sha256(p.read_bytes()).digest() for p in tmp_path.iterdir()}
     assert len(digests) == 1
 
@@ -277,18 +279,9 @@ def test_columns_of_matches_are_in_order_of_image_ids(
     # hypothesis would run all examples with the same tmp_path.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "example.db"
-        write_matches(
-            path,
-            [names[i] for i in order],
-            CAMERA,
-            [ImageKeypoints(0, np.empty((0, 2), np.float32), np.empty(0))] * 4,
-            pairs=np.empty((0, 2), np.int32),
-            matches=[],
-            geometries=[],
-        )
-        write_matches(
-            path, names, None, keypoints, pairs=pairs, matches=matches, geometries=geometries
-        )
+        write_matches(path, [names[i] for i in order], CAMERA, without_keypoints(4))
+        rows = MatchedImages(keypoints, pairs, matches, geometries, forward_motion=False)
+        write_matches(path, names, None, rows)
         ids = {image.name: image.image_id for image in read_images(path)}
         for (i, j), m in zip(pairs, matches, strict=True):
             a, b = ids[names[i]], ids[names[j]]
@@ -303,18 +296,15 @@ def test_columns_of_matches_are_in_order_of_image_ids(
             assert np.array_equal(np.frombuffer(stored).reshape(3, 3), F if a < b else F.T)
 
 
+def without_keypoints(num_images: int) -> MatchedImages:
+    nothing = ImageKeypoints(0, np.empty((0, 2), np.float32), np.empty(0))
+    pairs = np.empty((0, 2), np.int32)
+    return MatchedImages([nothing] * num_images, pairs, [], [], forward_motion=False)
+
+
 def write_images_only(path: Path) -> None:
     """Write a database in the schema of COLMAP 3.8 with images and without keypoints."""
-    nothing = [ImageKeypoints(i, np.empty((0, 2), np.float32), np.empty(0)) for i in range(16)]
-    write_matches(
-        path,
-        NAMES,
-        CAMERA,
-        nothing,
-        pairs=np.empty((0, 2), np.int32),
-        matches=[],
-        geometries=[],
-    )
+    write_matches(path, NAMES, CAMERA, without_keypoints(len(NAMES)))
 
 
 def write_text(path: Path) -> None:
@@ -326,11 +316,11 @@ def write_other_schema(path: Path) -> None:
 
 
 def write_with_matches(path: Path) -> None:
-    write_matches(path, NAMES, CAMERA, **ROWS)
+    write_matches(path, NAMES, CAMERA, ROWS)
 
 
 def write_other_images(path: Path) -> None:
-    write_matches(path, [f"x{name}" for name in NAMES], CAMERA, **ROWS)
+    write_matches(path, [f"x{name}" for name in NAMES], CAMERA, ROWS)
 
 
 def write_rigs_without_images(path: Path) -> None:
@@ -356,7 +346,7 @@ def test_refused_path_is_not_changed(
     prepare(path)
     before = path.read_bytes() if path.is_file() else None
     with pytest.raises(DatabaseError, match=message) as caught:
-        write_matches(path, NAMES, CAMERA, **ROWS)
+        write_matches(path, NAMES, CAMERA, ROWS)
     assert "\n" not in str(caught.value)
     assert (path.read_bytes() if path.is_file() else None) == before
     assert [p.name for p in tmp_path.iterdir()] == ["given.db"]
@@ -369,19 +359,19 @@ def test_special_files_are_refused_and_links_are_followed(tmp_path: Path) -> Non
     (tmp_path / "loop").symlink_to("loop")
     for name in ("pipe", "loop"):
         with pytest.raises(DatabaseError, match=name):
-            write_matches(tmp_path / name, NAMES, CAMERA, **ROWS)
+            write_matches(tmp_path / name, NAMES, CAMERA, ROWS)
         with pytest.raises(DatabaseError, match=name), open_unaltered(tmp_path / name):
             pass
     assert (tmp_path / "pipe").is_fifo()
     (tmp_path / "link").symlink_to("new.db")
-    write_matches(tmp_path / "link", NAMES, CAMERA, **ROWS)
+    write_matches(tmp_path / "link", NAMES, CAMERA, ROWS)
     assert (tmp_path / "link").is_symlink()
     assert len(read_images(tmp_path / "new.db")) == len(NAMES)
 
 
 def test_new_database_needs_an_existing_folder(tmp_path: Path) -> None:
     with pytest.raises(DatabaseError, match="folder"):
-        write_matches(tmp_path / "no" / "new.db", NAMES, CAMERA, **ROWS)
+        write_matches(tmp_path / "no" / "new.db", NAMES, CAMERA, ROWS)
 
 
 def test_new_database_is_refused_next_to_an_old_log(tmp_path: Path) -> None:
@@ -390,15 +380,15 @@ def test_new_database_is_refused_next_to_an_old_log(tmp_path: Path) -> None:
     (tmp_path / "link.db").symlink_to("new.db")
     for name in ("new.db", "link.db"):
         with pytest.raises(DatabaseError, match=r"new\.db-wal"):
-            write_matches(tmp_path / name, NAMES, CAMERA, **ROWS)
+            write_matches(tmp_path / name, NAMES, CAMERA, ROWS)
 
 
 def test_database_without_keypoints_but_with_matches_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
-    write_matches(path, NAMES, CAMERA, **ROWS)
+    write_matches(path, NAMES, CAMERA, ROWS)
     alter(path, "DELETE FROM keypoints")
     with pytest.raises(DatabaseError, match="matches"):
-        write_matches(path, NAMES, None, **ROWS)
+        write_matches(path, NAMES, None, ROWS)
 
 
 def test_missing_and_empty_files_have_no_images(tmp_path: Path) -> None:
@@ -407,7 +397,7 @@ def test_missing_and_empty_files_have_no_images(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "empty.db").touch()
     assert read_images(tmp_path / "empty.db") == []
-    write_matches(tmp_path / "empty.db", NAMES, CAMERA, **ROWS)
+    write_matches(tmp_path / "empty.db", NAMES, CAMERA, ROWS)
     assert len(read_images(tmp_path / "empty.db")) == len(NAMES)
 
 
@@ -416,7 +406,7 @@ def test_reading_needs_no_write_permission_and_creates_no_file(tmp_path: Path) -
     folder = tmp_path / "closed"
     folder.mkdir()
     path = folder / "given.db"
-    write_matches(path, NAMES, CAMERA, **ROWS)
+    write_matches(path, NAMES, CAMERA, ROWS)
     query(path, "PRAGMA journal_mode = WAL")
     before = path.read_bytes()
     folder.chmod(0o500)
@@ -442,13 +432,13 @@ def test_locked_database_is_reported_and_not_changed(
     other = sqlite3.connect(path, isolation_level=None)
     other.execute("BEGIN EXCLUSIVE")
     with pytest.raises(DatabaseError, match="in use"):
-        write_matches(path, NAMES, None, **ROWS)
+        write_matches(path, NAMES, None, ROWS)
     with pytest.raises(DatabaseError, match="in use"):
         check_writable(path)
     other.execute("ROLLBACK")
     other.close()
     assert dump(path) == before
-    write_matches(path, NAMES, None, **ROWS)
+    write_matches(path, NAMES, None, ROWS)
 
 
 class Interruption(BaseException):
@@ -468,9 +458,9 @@ def test_interrupted_write_leaves_the_file_unchanged(tmp_path: Path, existing: b
                 raise Interruption
             return super().__getitem__(index)
 
-    rows = {**ROWS, "geometries": Interrupting(ROWS["geometries"])}
+    rows = replace(ROWS, geometries=Interrupting(ROWS.geometries))
     with pytest.raises(Interruption):
-        write_matches(path, NAMES, CAMERA, **rows)
+        write_matches(path, NAMES, CAMERA, rows)
     assert (path.read_bytes() if existing else None) == before
     assert [p.name for p in tmp_path.iterdir()] == (["given.db"] if existing else [])
 
@@ -485,8 +475,8 @@ def test_killed_write_leaves_the_old_content(tmp_path: Path, journal: str) -> No
     check_writable(path)
     assert [image.num_keypoints for image in read_images(path)] == [0] * len(NAMES)
     assert dump(path) == before
-    write_matches(path, NAMES, None, **ROWS)
-    assert len(query(path, "SELECT * FROM matches")) == len(ROWS["pairs"])
+    write_matches(path, NAMES, None, ROWS)
+    assert len(query(path, "SELECT * FROM matches")) == len(ROWS.pairs)
 
 
 @pytest.mark.parametrize("existing", [False, True])
@@ -507,7 +497,7 @@ def test_failed_write_leaves_the_file_unchanged(tmp_path: Path, existing: bool) 
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
         try:
-            write_matches(sys.argv[1], NAMES, CAMERA, **ROWS)
+            write_matches(sys.argv[1], NAMES, CAMERA, ROWS)
         except DatabaseError as error:
             print(error)
     """
@@ -551,7 +541,7 @@ def test_every_camera_model_is_read_back_as_written(tmp_path: Path, model: str) 
     default = make_camera(CameraOptions(model), WIDTH, HEIGHT)
     text = ",".join(str(p + 0.25) for p in default.params)
     camera = make_camera(CameraOptions(model, text), WIDTH, HEIGHT)
-    write_matches(tmp_path / "new.db", NAMES, camera, **ROWS)
+    write_matches(tmp_path / "new.db", NAMES, camera, ROWS)
     stored = read_cameras(tmp_path / "new.db")[1]
     assert stored.model_name == model
     assert stored.params.tolist() == [p + 0.25 for p in default.params]

@@ -7,6 +7,7 @@ import sqlite3
 import subprocess
 import textwrap
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from synthetic_scene import HEIGHT, WIDTH, alignment_error
 from colmap_av1.database.reading import pair_id_from_image_ids, read_images
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import DatabaseError
+from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import OnExisting
@@ -152,7 +154,7 @@ def test_every_mapper_maps_every_database_it_can_open(
     path = tmp_path / "given.db"
     make_existing(path, layout, state)
     before = schema(path)
-    write_matches(path, NAMES, None, **OURS, on_existing=mode)
+    write_matches(path, NAMES, None, OURS, on_existing=mode)
     assert schema(path) == before
     check_model(map_with(mapper, path, tmp_path), 750 if mode == "append" else 380)
 
@@ -161,7 +163,7 @@ def test_every_mapper_maps_every_database_it_can_open(
 def test_global_mapper_maps_appended_rows(tmp_path: Path, layout: str) -> None:
     path = tmp_path / "given.db"
     make_existing(path, layout, "sift")
-    write_matches(path, NAMES, None, **OURS, on_existing="append")
+    write_matches(path, NAMES, None, OURS, on_existing="append")
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
     models = pycolmap.global_mapping(path, tmp_path, tmp_path / "model", options)
@@ -173,7 +175,7 @@ def test_append_keeps_existing_rows(tmp_path: Path, layout: str) -> None:
     path = tmp_path / "given.db"
     ids = make_existing(path, layout, "sift")
     before = content(path)
-    write_matches(path, NAMES, None, **OURS, on_existing="append")
+    write_matches(path, NAMES, None, OURS, on_existing="append")
     after = content(path)
     changed = {"keypoints", "descriptors", "matches", "two_view_geometries"}
     assert {k: v for k, v in after.items() if k not in changed} == {
@@ -181,7 +183,7 @@ def test_append_keeps_existing_rows(tmp_path: Path, layout: str) -> None:
     }
     num_existing = []
     for index, name in enumerate(NAMES):
-        theirs, ours = sift_keypoints(index), OURS["keypoints"][index].xy
+        theirs, ours = sift_keypoints(index), OURS.keypoints[index].xy
         found = read_keypoints(path, ids[name])
         num_existing.append(len(theirs))
         assert np.array_equal(found[: len(theirs)], theirs)
@@ -198,8 +200,10 @@ def test_append_keeps_existing_rows(tmp_path: Path, layout: str) -> None:
         assert rows == len(found)
         assert data == old + bytes(128 * len(ours))
     for kind, table in (("matches", "matches"), ("geometries", "two_view_geometries")):
-        assert np.array_equal(THEIRS["pairs"], OURS["pairs"])
-        for (i, j), theirs, ours in zip(OURS["pairs"], THEIRS[kind], OURS[kind], strict=True):
+        assert np.array_equal(THEIRS.pairs, OURS.pairs)
+        for (i, j), theirs, ours in zip(
+            OURS.pairs, getattr(THEIRS, kind), getattr(OURS, kind), strict=True
+        ):
             rows = [getattr(k, "inlier_matches", k) for k in (theirs, ours)]
             rows[1] = rows[1] + np.array([num_existing[i], num_existing[j]], np.uint32)
             found = read_pair(path, table, ids[NAMES[i]], ids[NAMES[j]])
@@ -209,10 +213,10 @@ def test_append_keeps_existing_rows(tmp_path: Path, layout: str) -> None:
 def test_appending_twice_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
     make_existing(path, "4.2", "sift")
-    write_matches(path, NAMES, None, **OURS, on_existing="append")
+    write_matches(path, NAMES, None, OURS, on_existing="append")
     before = path.read_bytes()
     with pytest.raises(DatabaseError, match="already"):
-        write_matches(path, NAMES, None, **OURS, on_existing="append")
+        write_matches(path, NAMES, None, OURS, on_existing="append")
     assert path.read_bytes() == before
 
 
@@ -222,16 +226,17 @@ def test_replace_removes_rows_of_the_named_images_only(tmp_path: Path, layout: s
     ids = make_existing(path, layout, "sift")
     before = content(path)
     named = NAMES[:5]
-    index = [k for k, (i, j) in enumerate(OURS["pairs"]) if max(i, j) < 5]
-    rows = {
-        "keypoints": OURS["keypoints"][:5],
-        "pairs": OURS["pairs"][index],
-        "matches": [OURS["matches"][k] for k in index],
-        "geometries": [OURS["geometries"][k] for k in index],
-    }
-    write_matches(path, named, None, **rows, on_existing="replace")
+    index = [k for k, (i, j) in enumerate(OURS.pairs) if max(i, j) < 5]
+    rows = replace(
+        OURS,
+        keypoints=OURS.keypoints[:5],
+        pairs=OURS.pairs[index],
+        matches=[OURS.matches[k] for k in index],
+        geometries=[OURS.geometries[k] for k in index],
+    )
+    write_matches(path, named, None, rows, on_existing="replace")
     list_images(fresh, layout)
-    write_matches(fresh, named, None, **rows)
+    write_matches(fresh, named, None, rows)
     after, ours = content(path), content(fresh)
     named_ids = {ids[name] for name in named}
     for table in ("keypoints", "descriptors"):
@@ -242,7 +247,7 @@ def test_replace_removes_rows_of_the_named_images_only(tmp_path: Path, layout: s
         kept = [r for r in before[table] if named_ids.isdisjoint(divmod(r[0], 2147483647))]
         assert len(kept) == 3
         assert after[table] == sorted(kept + ours[table])
-    write_matches(path, named, None, **rows, on_existing="replace")
+    write_matches(path, named, None, rows, on_existing="replace")
     assert content(path) == after
 
 
@@ -251,20 +256,21 @@ def test_existing_keypoints_are_an_error_by_default(tmp_path: Path) -> None:
     make_existing(path, "3.8", "sift")
     before = path.read_bytes()
     with pytest.raises(DatabaseError, match="on_existing"):
-        write_matches(path, NAMES, None, **OURS)
+        write_matches(path, NAMES, None, OURS)
     assert path.read_bytes() == before
 
 
-def one_pair(num: int, config: TwoViewConfig) -> dict[str, Any]:
+def one_pair(num: int, config: TwoViewConfig) -> MatchedImages:
     """Rows of two images with 60 matches, `num` of which are inliers."""
     xy = np.arange(200, dtype=np.float32).reshape(100, 2)
     inliers = np.repeat(np.arange(num, dtype=np.uint32), 2).reshape(num, 2)
-    return {
-        "keypoints": [ImageKeypoints(i, xy + i, np.arange(100)) for i in range(2)],
-        "pairs": np.array([[0, 1]], np.int32),
-        "matches": [np.repeat(np.arange(60, dtype=np.uint32), 2).reshape(60, 2)],
-        "geometries": [TwoViewGeometry(config, inliers, F=np.full((3, 3), float(num)))],
-    }
+    return MatchedImages(
+        [ImageKeypoints(i, xy + i, np.arange(100)) for i in range(2)],
+        np.array([[0, 1]], np.int32),
+        [np.repeat(np.arange(60, dtype=np.uint32), 2).reshape(60, 2)],
+        [TwoViewGeometry(config, inliers, F=np.full((3, 3), float(num)))],
+        forward_motion=False,
+    )
 
 
 @pytest.mark.parametrize(
@@ -300,7 +306,7 @@ def test_geometry_with_more_inliers_is_kept_when_merged(
     (their_config, their_inliers), (our_config, our_inliers) = theirs, ours
     config, inliers, F = merged
     path = tmp_path / "given.db"
-    write_matches(path, NAMES[:2], CAMERA, **one_pair(their_inliers, TwoViewConfig.UNCALIBRATED))
+    write_matches(path, NAMES[:2], CAMERA, one_pair(their_inliers, TwoViewConfig.UNCALIBRATED))
     alter(
         path,
         "UPDATE two_view_geometries SET config = ?, F = ?",
@@ -308,9 +314,9 @@ def test_geometry_with_more_inliers_is_kept_when_merged(
         np.full(9, -1.0).tobytes(),
     )
     rows = one_pair(our_inliers, our_config)
-    for keypoints in rows["keypoints"]:
+    for keypoints in rows.keypoints:
         keypoints.xy[:] += 0.5
-    write_matches(path, NAMES[:2], None, **rows, on_existing="append")
+    write_matches(path, NAMES[:2], None, rows, on_existing="append")
     found = read_pair(path, "two_view_geometries", 1, 2)
     ((stored, blob),) = query(path, "SELECT config, F FROM two_view_geometries")
     assert stored == config
@@ -328,11 +334,11 @@ def test_inliers_become_the_matches_of_a_pair_without_matches(tmp_path: Path) ->
     matches and a geometry.
     """
     path = tmp_path / "given.db"
-    write_matches(path, NAMES[:2], CAMERA, **one_pair(40, TwoViewConfig.UNCALIBRATED))
+    write_matches(path, NAMES[:2], CAMERA, one_pair(40, TwoViewConfig.UNCALIBRATED))
     alter(path, "DELETE FROM matches")
     rows = one_pair(30, TwoViewConfig.UNCALIBRATED)
-    rows["keypoints"][0].xy[:] += 0.5
-    write_matches(path, NAMES[:2], None, **rows, on_existing="append")
+    rows.keypoints[0].xy[:] += 0.5
+    write_matches(path, NAMES[:2], None, rows, on_existing="append")
     assert len(read_pair(path, "matches", 1, 2)) == 40 + 60
 
 
@@ -352,7 +358,7 @@ def test_empty_rows_are_replaced(tmp_path: Path, layout: str) -> None:
             "INSERT INTO two_view_geometries (pair_id, rows, cols, config) VALUES (?, 0, 2, 1)",
             pair_ids,
         )
-    write_matches(path, NAMES, None, **OURS)
+    write_matches(path, NAMES, None, OURS)
     assert query(path, "SELECT MIN(rows) > 0, MAX(cols) FROM keypoints") == [(1, 2)]
     assert query(path, "SELECT MIN(rows) > 0, MIN(config) FROM two_view_geometries") == [(1, 2)]
 
@@ -363,10 +369,10 @@ def test_images_are_added_with_their_frames(tmp_path: Path, layout: str, mode: O
     path = tmp_path / "given.db"
     list_images(path, layout, NAMES[:4])
     with pytest.raises(DatabaseError, match="4 images"):
-        write_matches(path, NAMES, CAMERA, **OURS)
+        write_matches(path, NAMES, CAMERA, OURS)
     with pytest.raises(DatabaseError, match="4 images"):
-        write_matches(path, NAMES, None, **OURS, on_existing=mode)
-    write_matches(path, NAMES, CAMERA, **OURS, on_existing=mode)
+        write_matches(path, NAMES, None, OURS, on_existing=mode)
+    write_matches(path, NAMES, CAMERA, OURS, on_existing=mode)
     images = read_images(path)
     assert {i.name: i.camera_id for i in images} == {
         name: 1 if name in NAMES[:4] else 2 for name in NAMES
@@ -396,7 +402,7 @@ def test_images_without_a_frame_get_one(tmp_path: Path, missing: int) -> None:
     whole = query(path, framed)
     alter(path, "DELETE FROM frames WHERE frame_id > ?", NUM_IMAGES - missing)
     alter(path, "DELETE FROM frame_data WHERE frame_id > ?", NUM_IMAGES - missing)
-    write_matches(path, NAMES, None, **OURS)
+    write_matches(path, NAMES, None, OURS)
     assert query(path, framed) == whole
     assert query(path, "SELECT * FROM rigs") == [(1, 1, 0)]
 
@@ -406,7 +412,7 @@ def test_no_frames_are_added_to_a_database_without_frames(tmp_path: Path) -> Non
     list_images(path, "4.2")
     for table in ("frame_data", "frames", "rigs"):
         alter(path, f"DELETE FROM {table}")
-    write_matches(path, NAMES, None, **OURS)
+    write_matches(path, NAMES, None, OURS)
     assert query(path, "SELECT * FROM rigs") == query(path, "SELECT * FROM frames") == []
 
 
@@ -418,7 +424,7 @@ def test_image_without_a_frame_is_refused_if_its_rig_has_several_cameras(tmp_pat
     alter(path, "DELETE FROM frame_data WHERE data_id = ?", ids[NAMES[0]])
     before = content(path)
     with pytest.raises(DatabaseError, match="rig_configurator"):
-        write_matches(path, NAMES, None, **OURS)
+        write_matches(path, NAMES, None, OURS)
     assert content(path) == before
 
 
@@ -438,10 +444,10 @@ def test_append_refuses_damaged_rows(tmp_path: Path, sql: str, message: str) -> 
     alter(path, sql)
     before = content(path)
     with pytest.raises(DatabaseError, match=message) as caught:
-        write_matches(path, NAMES, None, **OURS, on_existing="append")
+        write_matches(path, NAMES, None, OURS, on_existing="append")
     assert "\n" not in str(caught.value)
     assert content(path) == before
-    write_matches(path, NAMES, None, **OURS, on_existing="replace")
+    write_matches(path, NAMES, None, OURS, on_existing="replace")
 
 
 def check_matched_again(path: Path, before: list[Any]) -> None:
@@ -450,7 +456,7 @@ def check_matched_again(path: Path, before: list[Any]) -> None:
     Appended keypoints have descriptors of zeros, which a matcher must not match.
     """
     num_sift = {
-        i.image_id: len(THEIRS["keypoints"][NAMES.index(i.name)].xy) for i in read_images(path)
+        i.image_id: len(THEIRS.keypoints[NAMES.index(i.name)].xy) for i in read_images(path)
     }
     kept = {row[0]: row for row in before}
     num_new_matches = 0
@@ -480,7 +486,7 @@ def test_colmap_matcher_runs_after_an_append(tmp_path: Path) -> None:
     """Guided matching requires as many descriptors as keypoints."""
     path = tmp_path / "given.db"
     make_existing(path, "3.8", "sift")
-    write_matches(path, NAMES, None, **OURS, on_existing="append")
+    write_matches(path, NAMES, None, OURS, on_existing="append")
     before = drop_pairs(path)
     colmap(
         "exhaustive_matcher",
@@ -494,7 +500,7 @@ def test_colmap_matcher_runs_after_an_append(tmp_path: Path) -> None:
 def test_pycolmap_matcher_runs_after_an_append(tmp_path: Path, layout: str) -> None:
     path = tmp_path / "given.db"
     make_existing(path, layout, "sift")
-    write_matches(path, NAMES, None, **OURS, on_existing="append")
+    write_matches(path, NAMES, None, OURS, on_existing="append")
     before = drop_pairs(path)
     options = pycolmap.FeatureMatchingOptions()
     options.guided_matching = True
@@ -516,7 +522,7 @@ def test_killed_write_leaves_the_old_content(
     log = path.with_name(f"given.db-{'journal' if journal == 'delete' else 'wal'}")
     assert log.stat().st_size > 0  # the process was killed inside a transaction
     assert content(path) == before
-    write_matches(path, NAMES, None, **OURS, on_existing=mode)
+    write_matches(path, NAMES, None, OURS, on_existing=mode)
     assert content(path) != before
 
 
@@ -527,7 +533,7 @@ def test_partial_file_of_a_killed_process_is_removed(tmp_path: Path) -> None:
     assert partial.name.startswith(".new [1].db.")
     try:
         # The first process is still writing the partial file, which must stay.
-        write_matches(path, NAMES, CAMERA, **OURS)
+        write_matches(path, NAMES, CAMERA, OURS)
         assert sorted(p.name for p in tmp_path.iterdir()) == [partial.name, path.name]
     finally:
         kill(process)
@@ -535,7 +541,7 @@ def test_partial_file_of_a_killed_process_is_removed(tmp_path: Path) -> None:
     path.unlink()
     # A file with a similar name that no process of this package wrote must stay, too.
     (tmp_path / ".new [1].db.1.partial").touch()
-    write_matches(path, NAMES, CAMERA, **OURS)
+    write_matches(path, NAMES, CAMERA, OURS)
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         ".new [1].db.1.partial",
         path.name,
@@ -548,7 +554,7 @@ def test_replaced_database_keeps_cameras_and_other_tables(tmp_path: Path) -> Non
     fill_with_sift(path, ids)
     alter(path, "INSERT INTO pose_priors VALUES (?, ?, 0, NULL)", 1, np.ones(3).tobytes())
     before = content(path)
-    write_matches(path, NAMES, CAMERA, **OURS, on_existing="replace")
+    write_matches(path, NAMES, CAMERA, OURS, on_existing="replace")
     after = content(path)
     for table in ("cameras", "images", "pose_priors"):
         assert after[table] == before[table]

@@ -17,6 +17,7 @@ from colmap_av1.database.reading import read_images
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import DatabaseError, HlocError, OptionError
 from colmap_av1.interop.hloc import HlocMatches, export_hloc, read_hloc
+from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import ExportOptions
@@ -28,18 +29,18 @@ def read_folder(folder: Path) -> HlocMatches:
     return read_hloc(folder / "features.h5", folder / "matches.h5")
 
 
-def check_holds(found: HlocMatches, rows: dict[str, Any], kind: str) -> None:
+def check_holds(found: HlocMatches, rows: MatchedImages, kind: str) -> None:
     """Check that the rows were read, in any order of images and matches."""
     assert found.names == NAMES
     assert (found.sizes == [WIDTH, HEIGHT]).all()
-    for keypoints, expected in zip(found.keypoints, rows["keypoints"], strict=True):
+    for keypoints, expected in zip(found.keypoints, rows.keypoints, strict=True):
         assert keypoints.dtype == np.float32
         assert np.array_equal(keypoints, expected.xy)
     by_pair = {}
     for (i, j), matches in zip(found.pairs.tolist(), found.matches, strict=True):
         by_pair[min(i, j), max(i, j)] = matches if i < j else matches[:, ::-1]
-    assert sorted(by_pair) == sorted(map(tuple, rows["pairs"].tolist()))
-    for pair, expected in zip(rows["pairs"].tolist(), rows[kind], strict=True):
+    assert sorted(by_pair) == sorted(map(tuple, rows.pairs.tolist()))
+    for pair, expected in zip(rows.pairs.tolist(), getattr(rows, kind), strict=True):
         expected_rows = getattr(expected, "inlier_matches", expected).tolist()
         assert sorted(by_pair[tuple(pair)].tolist()) == sorted(expected_rows)
     assert all((scores == 1).all() for scores in found.scores)
@@ -58,7 +59,7 @@ def test_export_and_import_are_inverse(tmp_path: Path, layout: str, verified: bo
         ExportOptions(verified=verified),
         lambda *progress: seen.append(progress),
     )
-    assert counts == (len(NAMES), len(THEIRS["pairs"]))
+    assert counts == (len(NAMES), len(THEIRS.pairs))
     assert seen[-1] == ("pairs", counts[1], counts[1])
     assert path.read_bytes() == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["sift.db", "to"]
@@ -78,10 +79,13 @@ def test_layout_matches_hloc(tmp_path: Path) -> None:
         path,
         names,
         CAMERA,
-        [ImageKeypoints(i, xy + i, np.arange(3)) for i in range(3)],
-        pairs=np.array([[0, 2]], np.int32),
-        matches=[matches],
-        geometries=[geometry],
+        MatchedImages(
+            [ImageKeypoints(i, xy + i, np.arange(3)) for i in range(3)],
+            np.array([[0, 2]], np.int32),
+            [matches],
+            [geometry],
+            forward_motion=False,
+        ),
     )
     export_hloc(path, tmp_path / "hloc")
     with h5py.File(tmp_path / "hloc/features.h5") as file:
@@ -108,10 +112,16 @@ def test_positions_near_the_edge_are_exact(tmp_path: Path) -> None:
     xy = np.concatenate([rng.uniform(0, 1, (500, 2)), rng.uniform(0, 4000, (500, 2))])
     keypoints = ImageKeypoints(0, xy.astype(np.float32), np.arange(1000))
     none = ImageKeypoints(1, np.empty((0, 2), np.float32), np.empty(0, np.int64))
-    pair = {"pairs": np.array([[0, 2]], np.int32), "matches": [np.array([[7, 8]], np.uint32)]}
-    geometry = TwoViewGeometry(TwoViewConfig.UNCALIBRATED, pair["matches"][0], F=np.eye(3))
-    rows = [keypoints, none, keypoints]
-    write_matches(tmp_path / "a.db", NAMES[:3], CAMERA, rows, geometries=[geometry], **pair)
+    matches = np.array([[7, 8]], np.uint32)
+    geometry = TwoViewGeometry(TwoViewConfig.UNCALIBRATED, matches, F=np.eye(3))
+    rows = MatchedImages(
+        [keypoints, none, keypoints],
+        np.array([[0, 2]], np.int32),
+        [matches],
+        [geometry],
+        forward_motion=False,
+    )
+    write_matches(tmp_path / "a.db", NAMES[:3], CAMERA, rows)
     export_hloc(tmp_path / "a.db", tmp_path)
     found = read_folder(tmp_path)
     assert np.array_equal(found.keypoints[0], keypoints.xy)
@@ -131,17 +141,20 @@ def test_many_keypoints_need_wider_integers(tmp_path: Path) -> None:
         tmp_path / "a.db",
         NAMES[:2],
         CAMERA,
-        keypoints,
-        pairs=np.array([[0, 1]], np.int32),
-        matches=[matches],
-        geometries=[TwoViewGeometry(TwoViewConfig.UNCALIBRATED, matches, F=np.eye(3))],
+        MatchedImages(
+            keypoints,
+            np.array([[0, 1]], np.int32),
+            [matches],
+            [TwoViewGeometry(TwoViewConfig.UNCALIBRATED, matches, F=np.eye(3))],
+            forward_motion=False,
+        ),
     )
     export_hloc(tmp_path / "a.db", tmp_path)
     assert np.array_equal(read_folder(tmp_path).matches[0], matches)
 
 
 def test_same_database_gives_the_same_bytes(tmp_path: Path) -> None:
-    write_matches(tmp_path / "a.db", NAMES, CAMERA, **OURS)
+    write_matches(tmp_path / "a.db", NAMES, CAMERA, OURS)
     for folder in ("a", "b"):
         export_hloc(tmp_path / "a.db", tmp_path / folder)
     for name in FILES:
@@ -152,7 +165,7 @@ def test_hloc_reconstructs_from_the_files(tmp_path: Path) -> None:
     """Runs hloc itself if it is installed."""
     pytest.importorskip("hloc.reconstruction", reason="hloc is not installed")
     database, images = tmp_path / "a.db", tmp_path / "images"
-    write_matches(database, NAMES, CAMERA, **OURS)
+    write_matches(database, NAMES, CAMERA, OURS)
     export_hloc(database, tmp_path)
     images.mkdir()
     for name in NAMES:
@@ -164,7 +177,7 @@ def test_hloc_reconstructs_from_the_files(tmp_path: Path) -> None:
     model = pycolmap.Reconstruction(tmp_path / "sfm")
     assert model.num_reg_images() == len(NAMES)
     ids = {i.name: i.image_id for i in read_images(tmp_path / "sfm/database.db")}
-    for name, expected in zip(NAMES, OURS["keypoints"], strict=True):
+    for name, expected in zip(NAMES, OURS.keypoints, strict=True):
         ((cols, data),) = query(
             tmp_path / "sfm/database.db",
             "SELECT cols, data FROM keypoints WHERE image_id = ?",
@@ -284,7 +297,7 @@ def test_failures_leave_nothing(tmp_path: Path) -> None:
 
 
 def test_export_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_matches(tmp_path / "a.db", NAMES, CAMERA, **OURS)
+    write_matches(tmp_path / "a.db", NAMES, CAMERA, OURS)
     words = ["export", "--database", str(tmp_path / "a.db"), "--output", str(tmp_path / "h")]
     assert main([*words, "--format", "hloc", "--verified", "0"]) == 0
     table = dict(line.split("\t") for line in capsys.readouterr().out.splitlines())

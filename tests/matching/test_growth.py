@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -12,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, make_scene, match_scene
 
-from colmap_av1.database.writing import write_matched_images
+from colmap_av1.database.writing import write_matches
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.growth import Growth
 from colmap_av1.matching.image_matches import MatchedImages
@@ -49,19 +48,19 @@ def scene() -> tuple[MatchedImages, list[NDArray[np.float64]]]:
         kept[own] = is_second[own]
         if order < NUM_CROSSING:
             kept[own] = ~is_second[own] | (tracks.frame[own] == SEAM + order % 2)
-    rows: dict[str, Any] = match_scene(replace(made, tracks=tracks.keep_observations(kept)), CAMERA)
+    matched = match_scene(replace(made, tracks=tracks.keep_observations(kept)), CAMERA)
     poses = [
         np.column_stack([rotation, -rotation @ center])
         for rotation, center in zip(made.rotation, made.center, strict=True)
     ]
-    return MatchedImages(**rows, forward_motion=False), poses
+    return matched, poses
 
 
 def num_mapped(matched: MatchedImages, folder: Path, pair: tuple[int, int] | None) -> int:
     """Number of images in the first model of COLMAP's mapper that begins with a pair."""
     folder.mkdir()
     names = [f"{number:02}.jpg" for number in range(NUM_IMAGES)]
-    write_matched_images(folder / "a.db", names, CAMERAS, matched)
+    write_matches(folder / "a.db", names, CAMERAS, matched)
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0)
     if pair is not None:
         options.mapper.init_min_tri_angle = SMALL_ANGLES.init_min_tri_angle

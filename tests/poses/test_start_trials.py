@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -12,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, make_scene, match_scene
 
-from colmap_av1.database.writing import write_matched_images
+from colmap_av1.database.writing import write_matches
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pairs import PreparedStart
@@ -31,8 +30,7 @@ NAMES = [f"{number:02}.jpg" for number in range(NUM_IMAGES)]
 @pytest.fixture(scope="module")
 def scene() -> MatchedImages:
     """Images of one scene."""
-    rows: dict[str, Any] = match_scene(make_scene(num_frames=NUM_IMAGES), CAMERA)
-    return MatchedImages(**rows, forward_motion=False)
+    return match_scene(make_scene(num_frames=NUM_IMAGES), CAMERA)
 
 
 @pytest.fixture(scope="module", params=[(2, 7, 13), (6, 7, 8)], ids=["far", "neighbours"])
@@ -84,7 +82,7 @@ def with_moving_object(scene: MatchedImages, request: pytest.FixtureRequest) -> 
 def num_registered(matched: MatchedImages, folder: Path) -> list[int]:
     """The number of images of each model of COLMAP's mapper."""
     folder.mkdir()
-    write_matched_images(folder / "a.db", NAMES, [CAMERA] * NUM_IMAGES, matched)
+    write_matches(folder / "a.db", NAMES, [CAMERA] * NUM_IMAGES, matched)
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0)
     found = pycolmap.incremental_mapping(folder / "a.db", folder, folder, options=options)
     return [found[number].num_reg_images() for number in sorted(found)]

@@ -24,8 +24,8 @@ CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
 THEIR_SCENE, OUR_SCENE = (
     make_scene(num_frames=NUM_IMAGES, num_points=500, seed=seed) for seed in (1, 2)
 )
-THEIRS: dict[str, Any] = match_scene(THEIR_SCENE, CAMERA)
-OURS: dict[str, Any] = match_scene(OUR_SCENE, CAMERA)
+THEIRS = match_scene(THEIR_SCENE, CAMERA)
+OURS = match_scene(OUR_SCENE, CAMERA)
 
 
 def query(database: Path, sql: str, *values: object) -> list[tuple[Any, ...]]:
@@ -76,14 +76,14 @@ def list_images(path: Path, layout: str, names: Iterable[str] = NAMES) -> dict[s
 
 def sift_keypoints(index: int) -> NDArray[np.float32]:
     """Keypoints of an image with affine shapes, as of SIFT: float32 [n, 6]."""
-    xy = THEIRS["keypoints"][index].xy
+    xy = THEIRS.keypoints[index].xy
     shapes = np.random.default_rng(index).normal(0, 3, (len(xy), 4))
     return np.concatenate([xy, shapes], axis=1).astype(np.float32)
 
 
 def sift_descriptors(index: int) -> NDArray[np.uint8]:
     """Descriptors [n, 128] of norm 512, equal for all observations of a point."""
-    track = THEIRS["keypoints"][index].track
+    track = THEIRS.keypoints[index].track
     of_track = np.random.default_rng(0).gamma(1.0, 1.0, (track.max(initial=0) + 1, 128))
     of_track *= 512 / np.linalg.norm(of_track, axis=1, keepdims=True)
     return np.minimum(np.rint(of_track[track]), 255).astype(np.uint8)
@@ -107,7 +107,7 @@ def fill_with_sift(path: Path, ids: dict[str, int]) -> None:
                 (ids[name], len(descriptors), descriptors.tobytes()),
             )
         for (i, j), matches, geometry in zip(
-            THEIRS["pairs"], THEIRS["matches"], THEIRS["geometries"], strict=True
+            THEIRS.pairs, THEIRS.matches, THEIRS.geometries, strict=True
         ):
             a, b = ids[NAMES[i]], ids[NAMES[j]]
             pair_id = pair_id_from_image_ids(a, b)

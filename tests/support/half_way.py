@@ -11,7 +11,7 @@ from pathlib import Path
 from conftest import TEST_PATHS
 
 _WAITING = """
-    import os, sys, time
+    import dataclasses, os, sys, time
     sys.path[:0] = sys.argv[2].split(os.pathsep)
     import importlib
     from colmap_av1.database import file as database_file
@@ -34,9 +34,9 @@ _WAITING = """
         connection.execute("PRAGMA cache_size = 5")
         return connection
     database_file.sqlite3.connect = connect_small
-    new_rows = {**new_rows, "geometries": Waiting(new_rows["geometries"])}
+    new_rows = dataclasses.replace(new_rows, geometries=Waiting(new_rows.geometries))
     images = (data.NAMES, data.CAMERA)
-    database.write_matches(sys.argv[1], *images, **new_rows, on_existing=sys.argv[5])
+    database.write_matches(sys.argv[1], *images, new_rows, on_existing=sys.argv[5])
 """
 
 

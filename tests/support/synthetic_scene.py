@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.pairs import image_keypoints, pair_matches, schedule_pairs
-from colmap_av1.matching.two_view_geometry import TwoViewGeometry
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
@@ -83,20 +83,13 @@ def make_scene(
     return Scene(tracks, R, C)
 
 
-def match_scene(scene: Scene, camera: object) -> dict[str, object]:
-    """Run the stages up to verification, and return arguments of `write_matches` by name."""
+def match_scene(scene: Scene, camera: object) -> MatchedImages:
+    """Run the stages up to verification."""
     keypoints = image_keypoints(scene.tracks, range(scene.tracks.num_frames))
     pairs = schedule_pairs(keypoints, PairOptions())
     matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs]
-    geometries: list[TwoViewGeometry] = verify_pairs(
-        keypoints, pairs, matches, camera, VerifyOptions()
-    )
-    return {
-        "keypoints": keypoints,
-        "pairs": pairs,
-        "matches": matches,
-        "geometries": geometries,
-    }
+    geometries = verify_pairs(keypoints, pairs, matches, camera, VerifyOptions())
+    return MatchedImages(keypoints, pairs, matches, geometries, forward_motion=False)
 
 
 def alignment_error(estimated: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
