@@ -23,7 +23,7 @@ from colmap_av1.geometry.cameras import camera_fault
 # orientation for 4, a 2x2 affine shape for 6.
 SHAPES = {2: (), 4: (1.0, 0.0), 6: (1.0, 0.0, 0.0, 1.0)}
 # COLMAP's PosePriorCoordinateSystem: latitude, longitude and altitude, or Cartesian coordinates.
-_WGS84, _CARTESIAN = 0, 1
+WGS84, _CARTESIAN = 0, 1
 _POSITION_BYTES = 24
 
 
@@ -138,7 +138,7 @@ def read_pose_priors(database: str | os.PathLike[str]) -> dict[str, PosePrior]:
         rows: list[tuple[Any, ...]] = []
         if "prior_tx" in columns(connection, "images"):  # COLMAP 3.8 and 3.9
             rows += connection.execute(
-                f"SELECT name, {_WGS84}, prior_tx, prior_ty, prior_tz FROM images ORDER BY image_id"
+                f"SELECT name, {WGS84}, prior_tx, prior_ty, prior_tz FROM images ORDER BY image_id"
             ).fetchall()
         kept = columns(connection, "pose_priors")
         if {"position", "coordinate_system"} <= kept:
@@ -151,7 +151,7 @@ def read_pose_priors(database: str | os.PathLike[str]) -> dict[str, PosePrior]:
     return {
         name: PosePrior(np.array(position, dtype=np.float64), system == _CARTESIAN)
         for name, system, *position in rows
-        if system in (_WGS84, _CARTESIAN)
+        if system in (WGS84, _CARTESIAN)
         and all(isinstance(x, float) and math.isfinite(x) for x in position)
     }
 

@@ -16,6 +16,7 @@ from colmap_av1.database.file import is_new, write_existing, write_new
 from colmap_av1.database.layout import columns, has_rows
 from colmap_av1.database.reading import (
     SHAPES,
+    WGS84,
     image_ids_from_pair_id,
     keypoints_from_row,
     matches_from_row,
@@ -29,8 +30,6 @@ from colmap_av1.options import OnExisting
 
 # COLMAP's SensorType of a camera.
 _CAMERA_SENSOR = 0
-# COLMAP's PosePriorCoordinateSystem of latitude, longitude and altitude.
-WGS84 = 0
 # The layout of COLMAP 3.10 to 3.13. Later versions migrate it; earlier versions ignore the table.
 _POSE_PRIORS = (
     "CREATE TABLE pose_priors (image_id INTEGER PRIMARY KEY NOT NULL, position BLOB, "
