@@ -54,7 +54,7 @@ class PosedCamera:
         return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3])
 
     @property
-    def counting_cells(self) -> NDArray[np.bool_]:
+    def valid_cells(self) -> NDArray[np.bool_]:
         """Cells of the image that have valid pixels, bool [rows, columns]."""
         width, height = self.size
         rows, columns = -(-height // CELL), -(-width // CELL)
@@ -132,7 +132,7 @@ def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
     filled = total = 0
     for view in (views[i] for i in evenly_spread(len(views), _MOST_IMAGES)):
         depth = without_gaps(nearest_depth(view, xyz))
-        cells = view.counting_cells
+        cells = view.valid_cells
         filled += int(np.isfinite(depth[cells]).sum())
         total += int(cells.sum())
     return filled / max(total, 1)

@@ -41,7 +41,7 @@ class Mask:
             xy: [n, 2] positions in pixels, the first pixel's centre at (0.5, 0.5).
             size: (width, height) of the picture, which may differ from the mask's.
         """
-        return counted_at(self.kept, xy, size)
+        return valid_at(self.kept, xy, size)
 
 
 def make_mask(kept: NDArray[np.bool_]) -> Mask:
@@ -62,7 +62,7 @@ def joined_masks(a: Mask | None, b: Mask | None) -> Mask | None:
     return make_mask(a.kept & other)
 
 
-def counted_at(
+def valid_at(
     kept: NDArray[np.bool_], xy: NDArray[np.floating], size: tuple[int, int]
 ) -> NDArray[np.bool_]:
     """Whether positions lie on valid pixels, see `Mask.keeps`."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
-from colmap_av1.geometry.masks import Mask, counted_at, make_mask
+from colmap_av1.geometry.masks import Mask, make_mask, valid_at
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import READABLE
 from colmap_av1.images.names import natural_key, pattern_regex
@@ -324,8 +324,8 @@ def mask_tracks(
         own = order[first:last]
         passing, between = unseen.at(frame)
         own_size = size if scaled else (pixels.shape[1], pixels.shape[0])
-        kept[own] = counted_at(pixels, tracks.xy[own], own_size)
-        begins[passing] |= ~counted_at(pixels, between, own_size)
+        kept[own] = valid_at(pixels, tracks.xy[own], own_size)
+        begins[passing] |= ~valid_at(pixels, between, own_size)
     if kept.all() and not begins.any():
         return tracks
     return tracks.split_at_removed(kept, begins).keep_long(min_length)

@@ -125,7 +125,7 @@ def _filling(kept: ModelPoints, images: Sequence[PosedCamera], places: list[int]
     for number in _spread_order(len(places)) * _ROUNDS:
         own = images[places[number]]
         grid = without_gaps(np.minimum(nearest[number], nearest_depth(own, added)))
-        rows, columns = np.nonzero(np.isinf(grid) & own.counting_cells)
+        rows, columns = np.nonzero(np.isinf(grid) & own.valid_cells)
         if len(rows) == 0:
             continue
         depth = _depth_of_holes(grid, usual)

@@ -279,8 +279,8 @@ def model_stage(
         images = placed.images
         given = undistorted_masks(placed.masks, placed.camera_of_image, cameras)
         joined = placed.masks_with(dynamic_masks)
-        counting = undistorted_masks(joined, placed.camera_of_image, cameras)
-        views = views_of(images, cameras, counting)
+        valid = undistorted_masks(joined, placed.camera_of_image, cameras)
+        views = views_of(images, cameras, valid)
         with clock.measure("points"):
             tracked, agreeing = _tracked_points(run, placed, views, tracks)
             shows_dynamic = np.array([image.name in dynamic_masks for image in images])
@@ -296,7 +296,7 @@ def model_stage(
             folder.mkdir(parents=True)
             write_model(folder, cameras, images, cloud)
             if masked:
-                shown = counting if options.moving == "mask" else given
+                shown = valid if options.moving == "mask" else given
                 _write_masks(partial / _MASKS, images, cameras, shown)
         focal = [camera.mean_focal_length() for camera in cameras.values()]
         return ModelResult(

@@ -191,8 +191,8 @@ def _away_from_masks(view: PosedCamera) -> NDArray[np.bool_]:
     from scipy.ndimage import binary_dilation  # noqa: PLC0415 - slow to import
 
     if view.mask is None:
-        return view.counting_cells
-    left_out = replace(view, mask=make_mask(~view.mask.kept)).counting_cells
+        return view.valid_cells
+    left_out = replace(view, mask=make_mask(~view.mask.kept)).valid_cells
     return np.asarray(~binary_dilation(left_out, np.ones((3, 3))))
 
 

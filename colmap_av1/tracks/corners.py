@@ -21,9 +21,9 @@ from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.video.coded_size import smaller_grey
 
 _Floats = NDArray[np.float32]
-# Decides which positions [n, 2] are used, given the index of a frame and the (width, height) of its
-# picture.
-Counts = Callable[[int, _Floats, tuple[int, int]], NDArray[np.bool_]]
+# Returns which positions [n, 2] are valid, given the index of a frame and the (width, height) of
+# its picture.
+IsValid = Callable[[int, _Floats, tuple[int, int]], NDArray[np.bool_]]
 
 # Smallest strength of a corner, relative to the strongest one of the picture.
 _QUALITY = 0.01
@@ -56,7 +56,7 @@ class CornerDensity:
 def follow_corners(
     guide: Tracks,
     pictures: Iterable[tuple[int, NDArray[np.uint8]]],
-    counts: Counts,
+    is_valid: IsValid,
     progress: Callable[[int], None] | None = None,
     *,
     density: CornerDensity = CornerDensity(),
@@ -69,7 +69,7 @@ def follow_corners(
     Args:
         guide: tracks of the same video: a corner is searched for where the nearest track moves.
         pictures: (frame, picture) in the order of frames, uint8 BGR [height, width, 3] of one size.
-        counts: which positions are used, see `Counts`; for masks.
+        is_valid: which positions are valid, see `IsValid`; for masks.
         progress: called after each picture with the number of pictures so far.
         density: how many corners to follow.
         keep: called with each frame and its grey picture that is searched.
@@ -93,16 +93,16 @@ def follow_corners(
         if keep is not None:
             keep(frame, grey)
         scale = (np.array(picture.shape[1::-1]) / grey.shape[::-1]).astype(np.float32)
-        inside = partial(_are_used, counts, frame, grey.shape[::-1])
+        usable = partial(_are_usable, is_valid, frame, grey.shape[::-1])
         if before is not None and len(at):
             start, motion = _motion(observations(before[0]), observations(frame), guide.xy, track)
             expected = _nearest(start / scale, motion / scale, at)
             at, followed = _follow(before[1], grey, at, expected)
-            followed &= inside(at)
+            followed &= usable(at)
             number, at = number[followed], at[followed]
         if len(at) < _FEW * density.most:
             new = _new_corners(grey, at, density)
-            new = new[inside(new)]
+            new = new[usable(new)]
             number = np.concatenate([number, np.arange(count, count + len(new))])
             at, count = np.concatenate([at, new]), count + len(new)
         seen.append((frame, number, at))
@@ -175,10 +175,12 @@ def _follow(
     return found, forward & backward & (error <= _MAX_RETURN)
 
 
-def _are_used(counts: Counts, frame: int, size: tuple[int, int], at: _Floats) -> NDArray[np.bool_]:
-    """Whether positions lie inside the picture of a frame and are used."""
+def _are_usable(
+    is_valid: IsValid, frame: int, size: tuple[int, int], at: _Floats
+) -> NDArray[np.bool_]:
+    """Whether positions lie inside the picture of a frame and are valid."""
     inside = np.asarray(((at >= 0) & (at <= size)).all(axis=1))
-    inside[inside] = counts(frame, at[inside], size)
+    inside[inside] = is_valid(frame, at[inside], size)
     return inside
 
 

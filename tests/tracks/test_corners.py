@@ -49,7 +49,7 @@ def guide_along(shifts: NDArray[np.float64], starts: NDArray[np.float64]) -> Tra
     )
 
 
-def all_count(_: int, xy: NDArray[np.float32], __: tuple[int, int]) -> NDArray[np.bool_]:
+def all_valid(_: int, xy: NDArray[np.float32], __: tuple[int, int]) -> NDArray[np.bool_]:
     return np.ones(len(xy), np.bool_)
 
 
@@ -67,7 +67,7 @@ STARTS = np.array([[80.0, 60], [160, 120], [240, 180]])
 def test_corners_follow_the_texture() -> None:
     whole = texture(1)
     pictures = [(f, view(whole, s)) for f, s in enumerate(SLOW)]
-    found = follow_corners(guide_along(SLOW, STARTS), pictures, all_count)
+    found = follow_corners(guide_along(SLOW, STARTS), pictures, all_valid)
     assert found.num_tracks > 50
     assert found.lengths.min() >= 3
     assert np.percentile(motion_of(found, SLOW), 95) < 0.1
@@ -78,7 +78,7 @@ def test_large_jump_is_followed_with_the_guide() -> None:
     shifts = np.array([[0.0, 0], [2, 1], [92, -61], [95, -60]])
     whole = texture(2)
     pictures = [(f, view(whole, s)) for f, s in enumerate(shifts)]
-    found = follow_corners(guide_along(shifts, STARTS), pictures, all_count)
+    found = follow_corners(guide_along(shifts, STARTS), pictures, all_valid)
     across = np.isin(np.arange(found.num_tracks), found.track[found.frame == 1])
     across &= np.isin(np.arange(found.num_tracks), found.track[found.frame == 2])
     assert across.sum() > 30
@@ -105,7 +105,7 @@ def test_corners_of_large_pictures_are_in_full_size_pixels() -> None:
         small = view(whole, shift)
         large = cv2.resize(small, None, fx=5, fy=5, interpolation=cv2.INTER_CUBIC)
         pictures.append((frame, large))
-    found = follow_corners(guide_along(shifts, STARTS * 5), pictures, all_count)
+    found = follow_corners(guide_along(shifts, STARTS * 5), pictures, all_valid)
     assert found.xy[:, 0].max() > SIZE[0] * 4
     assert np.percentile(motion_of(found, shifts), 95) < 0.5
 
@@ -113,7 +113,7 @@ def test_corners_of_large_pictures_are_in_full_size_pixels() -> None:
 def test_density_sets_the_number_of_corners() -> None:
     pictures = [(k, view(texture(1), shift)) for k, shift in enumerate(SLOW)]
     few, many = (
-        follow_corners(guide_along(SLOW, STARTS), pictures, all_count, density=density)
+        follow_corners(guide_along(SLOW, STARTS), pictures, all_valid, density=density)
         for density in (CornerDensity(most=50), CornerDensity(most=300, spacing=6))
     )
     assert np.bincount(few.frame).max() <= 50
@@ -126,6 +126,6 @@ def test_too_few_or_untextured_pictures_give_no_tracks(count: int) -> None:
     whole = texture(5)
     shown = [(f, view(whole, s)) for f, s in enumerate(SLOW[:count])]
     guide = guide_along(SLOW, STARTS)
-    assert follow_corners(guide, shown, all_count).num_tracks == 0
+    assert follow_corners(guide, shown, all_valid).num_tracks == 0
     plain = [(f, np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)) for f in range(4)]
-    assert follow_corners(guide, plain, all_count).num_tracks == 0
+    assert follow_corners(guide, plain, all_valid).num_tracks == 0

@@ -81,7 +81,7 @@ def _followed(
             pictures.keep(image_of[first + frame], grey)
 
         corners = follow_corners(
-            guide, decoded, partial(_keeps, mask_of), report, density=density, keep=keep
+            guide, decoded, partial(_are_valid, mask_of), report, density=density, keep=keep
         )
         found = Tracks.concatenate(found, replace(corners, frame=corners.frame + np.int32(first)))
     return found
@@ -159,12 +159,12 @@ def _error(
     return float(np.where(in_camera[:, 2] > 0, np.minimum(error, _MAX_ERROR), _MAX_ERROR).mean())
 
 
-def _keeps(
+def _are_valid(
     mask_of: Mapping[int, Mask | None],
     frame: int,
     xy: NDArray[np.float32],
     size: tuple[int, int],
 ) -> NDArray[np.bool_]:
-    """Which positions in the picture of a frame its mask keeps; all if it has no mask."""
+    """Whether positions in the picture of a frame are valid; all are if it has no mask."""
     mask = mask_of[frame]
     return mask.keeps(xy, size) if mask is not None else np.ones(len(xy), np.bool_)
