@@ -1,4 +1,4 @@
-"""The size at which pictures are coded when only their motion is needed."""
+"""Downscaling of large pictures, to code their motion or to find features in them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ def usual_downscale(size: tuple[int, int]) -> int:
 
 
 def smaller_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Convert a BGR picture to grey, and downscale a large one by the usual factor."""
+    """Convert a BGR picture to grey, and downscale a large one by the usual factor.
+
+    Features are found in the result.
+    """
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     factor = usual_downscale(grey.shape[::-1])
     if factor > 1:
