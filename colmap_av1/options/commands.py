@@ -140,6 +140,7 @@ class ReconstructOptions(Options):
         "dynamic objects, such as people and cars: drop: they get no points; mask: they are also "
         "masked in the images for trainers; keep: do not detect them",
         common=True,
+        spellings=("dynamic",),
     )
     max_images: int = option(
         300,
