@@ -157,6 +157,8 @@ def _plain(value: Any, hint: Any) -> Any:
 
     Digests and command lines are made from plain numbers only.
     """
+    if type(value) in (int, float):
+        return value
     for member in members_of(hint):
         if member in (int, float) and _is_of(value, member):
             return member(value)

@@ -136,7 +136,10 @@ def test_help_shows_few_options_and_help_all_shows_all(
     few, every = options_in(short), options_in(full)
     assert few < every
     assert len(every) > 1.5 * len(few)
-    assert len(few - {"help", "help-all", "database_path", "video_path", "output_path"}) <= 25
+    assert (
+        len(few - {"help", "help-all", "database_path", "video_path", "output_path", "dynamic"})
+        <= 25
+    )
     assert {"help", "help-all", "quiet"} <= few
     assert options_in(help_of(command, "--help_all", capsys)) == every
 

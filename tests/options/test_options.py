@@ -249,8 +249,8 @@ def test_numpy_numbers_fractions_and_paths_are_accepted() -> None:
     assert words_of(ImageOptions(fps=Fraction(5, 2))) == ["--fps=2.5"]
     pairs = PairOptions(offsets=(np.int64(3),))
     assert digest_of([pairs]) == digest_of([PairOptions(offsets=(3,))])
-    tracks = TrackOptions(cosine=np.float32(0.5), border=3)
-    assert digest_of([tracks]) == digest_of([TrackOptions(cosine=0.5, border=3.0)])
+    tracks = TrackOptions(cosine=np.float32(0.5))
+    assert digest_of([tracks]) == digest_of([TrackOptions(cosine=0.5)])
     assert ImageOptions(frame_list=Path("a.txt")).frame_list == Path("a.txt")
 
 
