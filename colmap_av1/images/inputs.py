@@ -18,8 +18,8 @@ from colmap_av1.images.image_set import ImageSet, count_through
 from colmap_av1.images.masks import Masks, VideoMasks, read_masks
 from colmap_av1.images.photos import Photo, photo_files, read_photos
 from colmap_av1.options import CameraOptions, MatchOptions
+from colmap_av1.options.images import LONGEST_NAME
 from colmap_av1.util.digests import file_digest
-from colmap_av1.util.files import LONGEST_NAME
 from colmap_av1.video.facts import Video, count_shown, read_video
 from colmap_av1.video.metadata.lens import implausible_focal_length
 from colmap_av1.video.metadata.positions import implausible_position

@@ -13,8 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
-from colmap_av1.options.images import ImageOptions, check_extension, check_image_pattern
-from colmap_av1.util.files import LONGEST_NAME
+from colmap_av1.options.images import (
+    LONGEST_NAME,
+    ImageOptions,
+    check_extension,
+    check_image_pattern,
+)
 from colmap_av1.util.texts import check_name
 
 _MOST_DIGITS = 255

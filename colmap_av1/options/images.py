@@ -10,12 +10,14 @@ from typing import ClassVar, Literal
 
 from colmap_av1.errors import OptionError
 from colmap_av1.options.fields import Options, option
-from colmap_av1.util.files import LONGEST_NAME
 
 # Formats in which images are written.
 IMAGE_EXTENSIONS = (".png", ".jpg", ".jpeg")
 _NUMBER_FIELD = re.compile(r"%0?\d*d")
 _LONGEST_NUMBER = 20  # digits
+# Longest name of an output in bytes. File systems allow 255, but an output is first written under a
+# hidden name that has 33 more.
+LONGEST_NAME = 222
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,6 @@ _Path = str | os.PathLike[str]
 # Locks of some cluster file systems are visible on one machine only, so each machine removes only
 # its own leftovers.
 _OURS = f"colmap-av1-{zlib.crc32(socket.gethostname().encode()) & 0xFFFF:04x}"
-# Longest name of an output in bytes. File systems allow 255, but the hidden file has a longer name.
-LONGEST_NAME = 255 - len(f"..{_OURS}01234567.partial")
 
 
 def check_new_file(

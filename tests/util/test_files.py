@@ -13,8 +13,8 @@ import pytest
 from killed_runs import kill_while_replacing, kill_while_writing
 
 from colmap_av1.errors import OptionError
+from colmap_av1.options.images import LONGEST_NAME
 from colmap_av1.util.files import (
-    LONGEST_NAME,
     check_apart,
     check_new_file,
     check_new_folder,
