@@ -133,10 +133,10 @@ def test_frames_after_the_last_image_are_not_fast() -> None:
 
 
 def test_drive_with_evenly_short_tracks_is_not_fast() -> None:
-    """On a road at ten frames per second, about a fifth of the tracks are long."""
+    """On a road at ten frames per second, about a seventh of the tracks are long."""
     short, long = tracks_of_lengths(6, 160), tracks_of_lengths(40, 160)
     middle = np.arange(50, 110, dtype=np.int32)
-    drive = Tracks.concatenate(long, *[short] * 20).subsample_frames(middle)
+    drive = Tracks.concatenate(long, *[short] * 28).subsample_frames(middle)
     assert not fast_frames(drive).any()
     # With a turn, the whole stretch is fast.
     turn = short.keep_tracks(abs(short.frame[short.offsets[:-1]] - 80) < 10)
