@@ -134,12 +134,13 @@ def _place_of(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
 
 def _is_cut_short(path: Path) -> bool:
     """Whether a JPEG file is truncated; decoders would fill the missing part with grey."""
-    data = path.read_bytes()
-    if not data.startswith(_START_OF_IMAGE):
-        return False
+    with path.open("rb") as file:
+        if file.read(len(_START_OF_IMAGE)) != _START_OF_IMAGE:
+            return False
+        data = file.read()
     # Segments are skipped by their lengths because one may hold a thumbnail, which has the same
     # markers. What follows the image, such as the video of a motion photo, is not read.
-    marker = _MARKER.search(data, len(_START_OF_IMAGE))
+    marker = _MARKER.search(data)
     while marker is not None and marker[1] != _START_OF_SCAN:
         length = int.from_bytes(data[marker.end() : marker.end() + 2], "big")
         marker = _MARKER.search(data, marker.end() + length)

@@ -47,16 +47,15 @@ def joint_cameras(
         return run.cameras.of_images
     initial = _initial_cameras(run, image_set)
     adjusted = _adjusted_cameras(initial, image_set.images.names, models)
+    shared = [adjusted.get(id(camera), {}) for camera in initial]
     assumed = {
-        id(next(iter(adjusted[id(camera)].values())))
-        for camera in initial
-        if not (camera.has_prior_focal_length or _has_several(adjusted.get(id(camera), {})))
-        and id(camera) in adjusted
+        id(next(iter(own.values())))
+        for camera, own in zip(initial, shared, strict=True)
+        if own and not camera.has_prior_focal_length and not _has_several(own)
     }
     determined = _determined(run, [model for model, _ in models], assumed)
     cameras = []
-    for i, camera in enumerate(initial):
-        own = adjusted.get(id(camera), {})
+    for i, (camera, own) in enumerate(zip(initial, shared, strict=True)):
         if _has_several(own):
             index = np.array(list(own))
             nearest = own[int(index[np.argmin(np.abs(index - i))])]
