@@ -17,7 +17,11 @@ from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_o
 from colmap_av1.database.reading import DatabaseImage, read_images
 from colmap_av1.database.writing import check_writable, write_matches
 from colmap_av1.errors import DatabaseError, ModelError, OptionError, VideoError
-from colmap_av1.geometry.cameras import check_pixel_aspect, focal_length_warning
+from colmap_av1.geometry.cameras import (
+    check_pixel_aspect,
+    focal_length_warning,
+    with_known_focal_lengths,
+)
 from colmap_av1.images.files import alone_in, files_in
 from colmap_av1.images.image_set import ImageSet, ShownVideo, pictures_of
 from colmap_av1.images.inputs import Inputs, read_inputs
@@ -279,6 +283,9 @@ def match(
         is_undetermined = cameras is None and joint is not None and is_assumed
         is_known_ahead = start.limits == FORWARD_MOTION and not is_assumed
         fixed_intrinsics = is_known_ahead or is_undetermined
+        of_images = found.cameras
+        if is_undetermined:  # the mapper keeps the assumed intrinsics only if they count as known
+            of_images = with_known_focal_lengths(of_images)
         written = start.matched
         names = images.image_set.images.names
         crash = None
@@ -308,7 +315,7 @@ def match(
         write_matches(
             database,
             names,
-            None if listed else found.cameras,
+            None if listed else of_images,
             written,
             on_existing=options.on_existing,
             places=positions.places,

@@ -530,11 +530,16 @@ def test_hidden_frames_are_matched_in_display_order(encode: Encode, tmp_path: Pa
 def test_focal_length_that_a_short_clip_does_not_determine_is_kept(
     shared: Path, ffmpeg: Ffmpeg, tmp_path: Path
 ) -> None:
-    """If the mapper refined the focal length, it would diverge after two to five images."""
+    """If the mapper refined the focal length, it would diverge after two to five images.
+
+    Unless it counts as known, COLMAP 4.2 replaces it.
+    """
     clip = shared / "sequences" / "log_building" / "clip.mp4"
     short = ffmpeg("-i", clip, "-frames:v", "7", "-c:v", "copy", tmp_path / "short.mp4")
     report = match(tmp_path / "a.db", short, image_path=tmp_path / "frames")
     assert report.fixed_intrinsics
+    (row,) = tables(tmp_path / "a.db")["cameras"]
+    assert row[5] == 1
     assert "--Mapper.ba_refine_focal_length 0" in report.next_commands[0]
     assert "--refine_intrinsics 0" in report.next_commands[1]
     options = replace(report.map_options, num_threads=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pycolmap
@@ -125,6 +125,18 @@ def with_initial_intrinsics(camera: pycolmap.Camera) -> pycolmap.Camera:
     initial.params = params.tolist()
     initial.has_prior_focal_length = False
     return initial
+
+
+def with_known_focal_lengths(cameras: Sequence[pycolmap.Camera]) -> list[pycolmap.Camera]:
+    """Copies of the cameras whose focal length counts as known.
+
+    Otherwise COLMAP 4.2 replaces it by an estimate from the initial pair. Images share a camera if
+    it is the same object.
+    """
+    copies = {id(camera): copy.copy(camera) for camera in cameras}
+    for camera in copies.values():
+        camera.has_prior_focal_length = True
+    return [copies[id(camera)] for camera in cameras]
 
 
 def as_radial(camera: pycolmap.Camera) -> pycolmap.Camera:

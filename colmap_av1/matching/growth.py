@@ -37,6 +37,9 @@ class Growth:
         cameras: the camera of each image.
         known: for each model with known poses, float64 [3, 4] cam_from_world of each image, None if
             it is not in the model. An image is in one model at most.
+
+    Attributes:
+        model_of: int64 [num_images] index of the model of each image; -1 if it is in none.
     """
 
     def __init__(
@@ -56,12 +59,12 @@ class Growth:
         )
         views = np.repeat(np.arange(len(cameras)), np.diff(self._offsets))
         self._rays = np.full((len(views), 3), np.nan)
-        self._model_of = np.full(len(cameras), -1)
+        self.model_of = np.full(len(cameras), -1)
         for number, poses in enumerate(known):
             for i, pose in enumerate(poses):
                 if pose is None:
                     continue
-                self._model_of[i] = number
+                self.model_of[i] = number
                 x = np.asarray(cameras[i].cam_from_img(matched.keypoints[i].xy.astype(float)))
                 rays = np.column_stack([x, np.ones(len(x))]) @ pose[:, :3]
                 rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -81,10 +84,10 @@ class Growth:
         Returns:
             bool [num_images].
         """
-        model = _GrowingModel(len(self._model_of), self._num_tracks)
+        model = _GrowingModel(len(self.model_of), self._num_tracks)
         for image in pair:
             self._register(model, image)
-        is_other = self._model_of != self._model_of[pair[0]]
+        is_other = self.model_of != self.model_of[pair[0]]
         while max_images is None or model.registered.sum() < max_images:
             num_visible = np.where(is_other | model.registered, 0, model.num_visible)
             best = int(num_visible.argmax())

@@ -21,7 +21,6 @@ from colmap_av1.matching.mapper_limits import (
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
     INITIAL_SMALL_ANGLE,
-    RELAXED_LIMITS,
     SMALL_ANGLES,
     InitialLimits,
 )
@@ -105,8 +104,9 @@ def prepare_start(
     keep fewer inliers than the mapper ever accepts. Otherwise the images of fast turns might not
     register, and with forward motion the mapper might find no pair at all.
 
-    If poses are known of several models, the mapper begins several times, and pairs with a wrong
-    pose keep fewer inliers than it ever accepts, too.
+    If poses are known of several models, the mapper begins several times. Pairs with a wrong pose
+    keep fewer inliers than it ever accepts, too, and bad pairs of each model are demoted as those
+    of the first.
 
     Args:
         matched: the images. The pose of the homography is tested only for pairs with an essential
@@ -148,7 +148,13 @@ def prepare_start(
             if limits == SMALL_ANGLES and len(known) == 1:
                 most = _LEAST_INLIERS - 1
             # The demoted pairs change the order of the others.
-            demote = search.bad_pairs_of_all_limits(limits, demote, most)
+            demote = search.bad_pairs_of_limits([limits], demote, most)
+            if limits == SMALL_ANGLES:  # or the mapper begins without options
+                default = [DEFAULT_LIMITS, *DEFAULT_LIMITS.relaxed]
+                demote = search.bad_pairs_of_limits(default, demote, most)
+            for number in range(1, len(known)):
+                own = search.of_model(number)
+                demote = own.bad_pairs_of_limits([limits, *limits.relaxed], demote, most)
             is_tried = not search.has_untried_pair
     return PreparedStart(with_demoted(matched, demote, most), limits, is_certain, is_tried)
 
@@ -287,6 +293,12 @@ class _Search:
         grown = [int(growth.registered(matched.pairs[k].tolist()).sum()) for k in some]
         self._large_size = math.ceil(_LARGE * max(grown, default=0))
 
+    def of_model(self, number: int) -> _Search:
+        """The search among the images of one model, after the others are registered."""
+        is_own = self._growth.model_of[self._matched.pairs] == number
+        found = replace(self._found, count=np.where(is_own.all(axis=1), self._found.count, 0))
+        return _Search(self._matched, self._cameras, found, self._growth)
+
     def first_certain(self) -> tuple[InitialLimits | None, set[int]]:
         """The first limits with which the mapper finds a good pair, and the bad pairs before it.
 
@@ -300,27 +312,24 @@ class _Search:
                     return limits, bad
         return None, set()
 
-    def bad_pairs_of_all_limits(
-        self, limits: InitialLimits, demoted: set[int], most: int
+    def bad_pairs_of_limits(
+        self, each: Iterable[InitialLimits], demoted: set[int], most: int
     ) -> set[int]:
-        """Pairs that the mapper may find before a good one, with options or without.
-
-        Without options, it lowers its default limits until it finds a pair.
+        """Pairs that the mapper may find before a good one, with several limits in turn.
 
         Args:
-            limits: the limits of the options.
+            each: the limits, in the order in which the mapper tries them.
             demoted: indices of pairs that are demoted.
             most: number of inliers that demoted pairs keep.
 
         Returns:
             Indices of these pairs, including the demoted ones.
         """
-        bad, _ = self.bad_pairs(limits, demoted, most)
-        if limits == SMALL_ANGLES:
-            for own in (DEFAULT_LIMITS, *RELAXED_LIMITS):
-                bad, has_good = self.bad_pairs(own, bad, most)
-                if has_good:
-                    break
+        bad = demoted
+        for limits in each:
+            bad, has_good = self.bad_pairs(limits, bad, most)
+            if has_good:
+                break
         return bad
 
     def bad_pairs(

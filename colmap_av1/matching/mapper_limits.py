@@ -6,7 +6,7 @@ images.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 # Fewest inliers of a pair that a mapper uses (min_num_matches).
 MIN_INLIERS = 15
@@ -55,6 +55,18 @@ class InitialLimits:
         options = self.options.items()
         return [word for name, value in options for word in (f"--Mapper.{name}", f"{value:g}")]
 
+    @property
+    def relaxed(self) -> list[InitialLimits]:
+        """The limits that the mapper tries next if images are left and no pair meets these.
+
+        It halves the number of inliers, then the angle, then both once more in this order.
+        """
+        inliers, angle = self.init_min_num_inliers, self.init_min_tri_angle
+        return [
+            replace(self, init_min_num_inliers=inliers // few, init_min_tri_angle=angle / small)
+            for few, small in ((2, 1), (2, 2), (4, 2), (4, 4))
+        ]
+
 
 DEFAULT_LIMITS = InitialLimits()
 # For videos in which all angles are small.
@@ -62,14 +74,3 @@ SMALL_ANGLES = InitialLimits(init_min_tri_angle=INITIAL_SMALL_ANGLE)
 # For videos in which the camera moves along its axis, as on a drive: all angles are small, and the
 # motion excludes no pair.
 FORWARD_MOTION = InitialLimits(init_max_forward_motion=1.0, init_min_tri_angle=INITIAL_SMALL_ANGLE)
-# If no pair meets its limits, the mapper halves the number of inliers, then the angle, then both
-# once more in this order.
-RELAXED_LIMITS = tuple(
-    InitialLimits(init_min_num_inliers=INITIAL_MIN_INLIERS // few, init_min_tri_angle=angle)
-    for few, angle in (
-        (2, INITIAL_MIN_ANGLE),
-        (2, INITIAL_MIN_ANGLE / 2),
-        (4, INITIAL_MIN_ANGLE / 2),
-        (4, INITIAL_MIN_ANGLE / 4),
-    )
-)

@@ -17,9 +17,10 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matches
+from colmap_av1.geometry.cameras import with_known_focal_lengths
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pairs import PreparedStart, are_far, with_demoted
-from colmap_av1.matching.mapper_limits import RELAXED_LIMITS
+from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
 from colmap_av1.util.run_context import RunContext
@@ -68,14 +69,9 @@ def demote_failing_starts(
         seed=0,
         num_threads=1,
     )
-    # Assumed focal lengths count as known: otherwise COLMAP 4.2 estimates them together with the
-    # first pose, and its solver crashes on some pairs.
-    copies = {id(camera): pycolmap.Camera(camera.todict()) for camera in cameras}
-    for camera in copies.values():
-        camera.has_prior_focal_length = True
-    known = [copies[id(camera)] for camera in cameras]
-
-    lower = vars(RELAXED_LIMITS[1]) if not start.is_certain else {}
+    # COLMAP 4.2 crashes on some pairs when it estimates the focal length.
+    known = with_known_focal_lengths(cameras)
+    lower = vars(DEFAULT_LIMITS.relaxed[1]) if not start.is_certain else {}
     initial_pair = {**lower, **start.limits.options}
 
     def failing_start(matched: MatchedImages) -> list[str] | None:

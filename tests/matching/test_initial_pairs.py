@@ -222,25 +222,25 @@ def test_pair_with_few_inliers_is_demoted_if_no_pair_has_a_large_angle() -> None
 def num_inliers(
     views: list[tuple[list[ImageKeypoints], NDArray[np.uint32]]],
     poses: list[NDArray[np.float64] | None],
-    *,
-    apart: bool = False,
+    models: list[int] | None = None,
 ) -> list[int]:
     """Number of inliers that each pair of images keeps, given the poses of their second images.
 
-    The images of a pair are no neighbours. With None, the pose of both images is unknown. The
-    images are in one model, or each pair is in its own.
+    The images of a pair are no neighbours. With None, the pose of both images is unknown. `models`
+    gives the model of each pair; without it, all are in one.
     """
+    models = models or [0] * len(views)
     nothing = np.empty((0, 2), np.float32)
     keypoints = [ImageKeypoints(i, nothing, np.arange(0)) for i in range(8 * len(views))]
     known: list[list[NDArray[np.float64] | None]] = [
-        [None] * len(keypoints) for _ in range(len(views) if apart else 1)
+        [None] * len(keypoints) for _ in range(1 + max(models))
     ]
     pairs = np.array([[8 * i, 8 * i + 4] for i in range(len(views))], dtype=np.int32)
     for i, ((own, _), pose) in enumerate(zip(views, poses, strict=True)):
         first, second = pairs[i].tolist()
         keypoints[first], keypoints[second] = own
         if pose is not None:
-            model = known[i if apart else 0]
+            model = known[models[i]]
             model[first], model[second] = np.eye(3, 4), pose
     geometries = [verified(*own) for own in views]
     matched = MatchedImages(
@@ -280,11 +280,20 @@ def test_pair_whose_intrinsics_diverge_is_demoted() -> None:
     assert num_inliers(views, [TURNED, TURNED]) == [300, INITIAL_MIN_INLIERS // 2 - 1]
 
 
+def test_pair_whose_intrinsics_diverge_is_demoted_in_a_further_model() -> None:
+    """The mapper begins again, after it has registered the images of the first model."""
+    rng = np.random.default_rng(3)
+    good, diverging = turned_views(0.5, 0.3, 300, rng), turned_views(0.1, 0.02, 250, rng)
+    views, models = [*[good] * 20, good, diverging], [*[0] * 20, 1, 1]
+    kept = num_inliers(views, [TURNED] * len(views), models)
+    assert kept == [*[300] * 21, INITIAL_MIN_INLIERS // 2 - 1]
+
+
 @pytest.mark.parametrize(
-    ("apart", "count"),
-    [(False, INITIAL_MIN_INLIERS // 2 - 1), (True, INITIAL_MIN_INLIERS // 4 - 1)],
+    ("models", "count"),
+    [([0, 0], INITIAL_MIN_INLIERS // 2 - 1), ([0, 1], INITIAL_MIN_INLIERS // 4 - 1)],
 )
-def test_pair_with_two_possible_poses_is_demoted(apart: bool, count: int) -> None:
+def test_pair_with_two_possible_poses_is_demoted(models: list[int], count: int) -> None:
     """The mapper takes the motion towards a wall for a turn, with twice the angle.
 
     A pair of a further model is demoted below the lowest limit.
@@ -292,4 +301,4 @@ def test_pair_with_two_possible_poses_is_demoted(apart: bool, count: int) -> Non
     rng = np.random.default_rng(3)
     views = [turned_views(0.5, 0.3, 300, rng), towards_a_wall(rng)]
     assert angle_of_mapper(*views[1]) > INITIAL_MIN_ANGLE
-    assert num_inliers(views, [TURNED, TOWARDS], apart=apart) == [300, count]
+    assert num_inliers(views, [TURNED, TOWARDS], models) == [300, count]
