@@ -25,10 +25,11 @@ LEAST_MATCHES = 30
 # image side (0.4 to 0.5 degrees).
 _QUANTILE, _LEAST_PARALLAX = 0.75, 8.5e-3
 # About this share of the pairs of a hand-held zoom seems to have parallax, because zooming changes
-# the lens distortion. A fifth of the pairs has parallax if somebody films a room from a few places,
-# more than half on a flight over a plain, and nearly all on walks and drives. Depth is observable
-# if significantly more pairs have parallax: more by this number of standard deviations.
-_ZOOM_SHARE, _SIGNIFICANT = 0.1, 2.0
+# the lens distortion, and less if the focal length is known. A fifth of the pairs has parallax if
+# somebody films a room from a few places, more than half on a flight over a plain, and nearly all
+# on drives and walks, except in fast turns. Depth is observable if significantly more pairs have
+# parallax: more by this number of standard deviations.
+_ZOOM_SHARE, _KNOWN_SHARE, _SIGNIFICANT = 0.1, 0.04, 2.0
 # Depth is unreliable if a smaller share of the pairs has parallax.
 _RELIABLE_SHARE = 0.4
 # Number of Gauss-Newton steps, and the scale of the robust loss in units of the longer image side.
@@ -48,16 +49,19 @@ class DepthEvidence:
     Attributes:
         num_pairs: pairs that were tested, the ones with the widest motion.
         num_with_parallax: pairs whose motion no rotation and zoom of the camera explains.
+        is_focal_length_known: whether all images have a known focal length.
     """
 
     num_pairs: int
     num_with_parallax: int
+    is_focal_length_known: bool
 
     @property
     def is_observable(self) -> bool:
         """Whether the matches determine depth at all; True if no pair was tested."""
-        expected = _ZOOM_SHARE * self.num_pairs
-        deviation = math.sqrt(expected * (1 - _ZOOM_SHARE))
+        share = _KNOWN_SHARE if self.is_focal_length_known else _ZOOM_SHARE
+        expected = share * self.num_pairs
+        deviation = math.sqrt(expected * (1 - share))
         return self.num_with_parallax >= expected + _SIGNIFICANT * deviation
 
     @property
@@ -122,7 +126,11 @@ def depth_evidence(
             continue
         residuals = _turn_and_zoom_residuals(*(end[is_known] for end in ends))
         parallax.append(float(np.quantile(residuals, _QUANTILE, axis=1).min()))
-    return DepthEvidence(len(parallax), int(np.sum(np.array(parallax) > _LEAST_PARALLAX)))
+    return DepthEvidence(
+        len(parallax),
+        int(np.sum(np.array(parallax) > _LEAST_PARALLAX)),
+        all(camera.has_prior_focal_length for camera in cameras if camera is not None),
+    )
 
 
 def depth_of_images(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) -> DepthEvidence:

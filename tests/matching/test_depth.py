@@ -73,20 +73,30 @@ def test_depth_is_observable_if_the_camera_moves(flat: bool, zoom: float) -> Non
 
 
 def test_depth_warning_if_the_camera_moves_only_at_the_end() -> None:
-    found = DepthEvidence(num_pairs=40, num_with_parallax=14)
+    found = DepthEvidence(num_pairs=40, num_with_parallax=14, is_focal_length_known=True)
     assert found.is_observable
     assert found.warning is not None
 
 
 @pytest.mark.parametrize(
-    ("num_pairs", "num_with_parallax", "is_observable"),
-    [(36, 8, True), (39, 5, False), (17, 4, False), (0, 0, True)],
+    ("num_pairs", "num_with_parallax", "is_observable", "is_if_known"),
+    [
+        (36, 8, True, True),
+        (39, 5, False, True),
+        (17, 4, False, True),
+        (35, 3, False, False),
+        (0, 0, True, True),
+    ],
 )
 def test_depth_is_observable_if_more_pairs_have_parallax_than_in_a_zoom(
-    num_pairs: int, num_with_parallax: int, is_observable: bool
+    num_pairs: int, num_with_parallax: int, is_observable: bool, is_if_known: bool
 ) -> None:
-    """Few pairs with parallax are enough, but not if they may be chance."""
-    assert DepthEvidence(num_pairs, num_with_parallax).is_observable == is_observable
+    """Few pairs with parallax are enough, but not if they may be chance.
+
+    Fewer are enough if the focal length is known.
+    """
+    for is_known, expected in ((False, is_observable), (True, is_if_known)):
+        assert DepthEvidence(num_pairs, num_with_parallax, is_known).is_observable == expected
 
 
 @pytest.mark.shared
