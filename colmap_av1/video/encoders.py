@@ -121,7 +121,7 @@ ENCODERS = {
     ),
     # Speed 7 takes a third to a half of the time of speed 6 for models that are nearly as good.
     # Speed 8 saves little more and gives up to 8 % fewer points. Other settings are compared in
-    # examples/benchmarks/README.md, "Encoders".
+    # docs/benchmarks.md, "Encoders".
     "libaom": _Encoder("libaom-av1", 20, 7, 10, _libaom),
     "svt": _Encoder("libsvtav1", 20, 8, 8, _svt),
 }

@@ -234,15 +234,6 @@ def dense_points(rows: list[Row]) -> str:
 
 # Largest error of camera centres, in per cent of their extent, of a model that is not bent.
 STRAIGHT = 0.5
-# The steps of `end_to_end.py`, and the step of SIFT that each is compared with.
-SIFT_DATABASE, SIFT_MAPPER = "SIFT sequential: database", "SIFT sequential: mapper"
-SIFT_MODEL = "SIFT sequential: model"
-COMPARED_WITH = {
-    "match: database": SIFT_DATABASE,
-    "match: mapper": SIFT_MAPPER,
-    "reconstruct: dense model": SIFT_MODEL,
-    "densify on SIFT's model": SIFT_MODEL,
-}
 
 
 # Ways of `phone_to_folder.py`: from the file, from the AV1 stream, and SIFT for comparison.
@@ -379,31 +370,6 @@ def phone_to_folder_stages(rows: list[Row]) -> str:
     ]
     shown = [{"way": way} for way in (*ways, FROM_STREAM)]
     return f"{markdown(columns, shown)}\n{measured_at(staged, 'clip')}"
-
-
-def end_to_end(rows: list[Row]) -> str:
-    """All steps from a video to a model, with ratios to those of SIFT."""
-    by_way = {(row["sequence"], row["way"]): row for row in rows}
-
-    def with_ratio(heading: str, name: str, spelling: str) -> Column:
-        def cell(row: Row) -> str:
-            base = by_way.get((row["sequence"], COMPARED_WITH.get(row["way"], "")))
-            times = share_of(row, name, base, ".2f").lstrip(", ")
-            return number(row, name, spelling) + (f" ({times}x)" if times else "")
-
-        return Column(heading, cell)
-
-    columns = [
-        words("sequence, way", "sequence", "way"),
-        with_ratio("images", "images", ".0f"),
-        with_ratio("points", "points", ",.0f"),
-        with_ratio("error px", "error_px", ".3f"),
-        with_ratio("ATE", "ate", ".4f"),
-        with_ratio("seconds", "seconds", ".1f"),
-        with_ratio("CPU seconds", "cpu_s", ".1f"),
-        figure("peak memory", "peak_memory_mb", ".0f", " MB"),
-    ]
-    return f"{markdown(columns, rows)}\n{measured_at(rows, 'sequence')}"
 
 
 def jerks(rows: list[Row]) -> str:
@@ -729,7 +695,6 @@ TABLES: dict[str, Callable[..., str]] = {
     "phone_to_folder.stages": phone_to_folder_stages,
     "jerks": jerks,
     "loops": loops,
-    "end_to_end": end_to_end,
     "read_motion": read_motion,
     "dav1d_profile": dav1d_profile,
     "verification": verification,
@@ -742,7 +707,6 @@ TABLES: dict[str, Callable[..., str]] = {
     "one_model": one_model,
     "walks": walks,
     "long_video": plain,
-    "batch": plain,
     "image_pairs": plain,
     "appended": plain,
     "camera_model": plain,
