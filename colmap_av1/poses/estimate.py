@@ -203,6 +203,9 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         try:
             posed = split(links, None)
         except ModelError:  # the poses without them can be used
+            # The stages on disk are those with the links, and must be made again.
+            for made in (map_key_images, pose, split):
+                made.cache_clear()
             return no_links
         if not first_estimate.may_be_right or not _is_contradicted(posed):
             return links
