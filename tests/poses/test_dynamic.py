@@ -371,6 +371,14 @@ def test_tracks_continue_behind_a_passing_object(passed: Passed) -> None:
     assert on_it.mean() < 0.001
 
 
+def test_camera_that_stands_still_gives_no_tracks(passed: Passed) -> None:
+    """The pictures of another video may show parallax."""
+    pose = passed.placed.images[0].cam_from_world
+    still = [replace(image, cam_from_world=pose) for image in passed.placed.images]
+    placed = replace(passed.placed, images=still)
+    assert follow_behind(passed.run, passed.moving, passed.tracks, placed).num_tracks == 0
+
+
 @pytest.mark.parametrize("pixels", [1, 7])
 def test_wrong_poses_do_not_continue_tracks_wrongly(passed: Passed, pixels: float) -> None:
     """Where the predicted position is wrong, another feature there is not followed instead."""

@@ -22,6 +22,7 @@ from colmap_av1.poses.posed_images import FOR_POSES, PosedImages
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.grouping import grouped
 from colmap_av1.util.progress import no_progress, progress_in
 
 # Number of images after the last observation of a point in which it is searched; later its
@@ -79,6 +80,8 @@ def follow_behind(
             num_threads=run.context.num_threads,
             progress=no_progress,
         )
+        if len(points.xyz) == 0:  # the camera of this video stands still
+            continue
         expected, is_expected = expect_in_views(seen, view, points, views, frames)
         first_frame = int(placed.first_frame[video])
         corrected = _on_pictures(run, video, expected, is_expected, first_frame)
@@ -130,14 +133,15 @@ def expect_in_views(
     point = np.repeat(np.arange(num_points), np.diff(points.offsets))
     seen_by = view[points.observation]
     first, last = seen_by[points.offsets[:-1]], seen_by[points.offsets[1:] - 1]
-    is_seen = np.zeros((len(views), num_points), np.bool_)
-    is_seen[seen_by, point] = True
+    by_view, bounds = grouped(seen_by, len(views))
     points_in, xy_in = [point], [tracks.xy[points.observation]]
     for number, camera in enumerate(views):
-        index, xy, _ = camera.project(points.xyz)
-        near = (first[index] < number) & (last[index] >= number - _REACH)
-        inside = ((xy >= _MARGIN) & (xy <= np.array(camera.size) - _MARGIN)).all(axis=1)
-        new = near & inside & ~is_seen[number, index]
+        near = np.flatnonzero((first < number) & (last >= number - _REACH))
+        there = np.setdiff1d(near, point[by_view[bounds[number] : bounds[number + 1]]])
+        index, xy, _ = camera.project(points.xyz[there])
+        index = there[index]
+        inside = (xy >= _MARGIN) & (xy <= np.array(camera.size) - _MARGIN)
+        new = np.asarray(inside.all(axis=1))
         new[new] = camera.keeps(xy[new])
         points_in.append(index[new])
         xy_in.append(xy[new].astype(np.float32))
