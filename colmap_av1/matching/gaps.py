@@ -161,6 +161,8 @@ def should_examine_pictures(
     inter_share: NDArray[np.float32],
     frames: NDArray[np.int32],
     tracks: Tracks,
+    *,
+    fast: NDArray[np.bool_],
     links: LinkOptions,
     min_length: int,
 ) -> bool:
@@ -170,9 +172,8 @@ def should_examine_pictures(
     without them if the video is shorter than `min_length`, the fewest frames of a track.
     """
     lacks_tracks = tracks.num_tracks == 0 and tracks.num_frames >= min_length
-    return links.links == "sift" or (
-        links.links == "auto" and (lacks_tracks or bool(low_inter_gaps(inter_share, frames).any()))
-    )
+    is_doubtful = fast[frames].any() or low_inter_gaps(inter_share, frames).any()
+    return links.links == "sift" or (links.links == "auto" and bool(lacks_tracks or is_doubtful))
 
 
 def probed_gaps(

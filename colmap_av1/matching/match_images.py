@@ -162,7 +162,12 @@ def pair_videos(
     for number, video in enumerate(videos):
         chosen = image_set.of_video(number)
         examines_pictures = should_examine_pictures(
-            video.inter_share, chosen.frames, video.tracks, options.links, options.min_length
+            video.inter_share,
+            chosen.frames,
+            video.tracks,
+            fast=video.fast,
+            links=options.links,
+            min_length=options.min_length,
         )
         paired.append(
             pair_images(

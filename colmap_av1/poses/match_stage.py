@@ -235,5 +235,5 @@ def _match_images(
         options=groups,
         context=context,
         name=run.inputs.name,
-        images_apart=len(image_set.sequence) / len(keyed.sequence),
+        images_apart=image_set.images_of(len(videos)).start / keyed.images_of(len(videos)).start,
     )

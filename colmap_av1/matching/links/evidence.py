@@ -91,7 +91,9 @@ def confirmed_gaps(
     for (i, j), geometry in zip(matched.pairs.tolist(), matched.geometries, strict=True):
         if j == i + 1:
             across[i] = len(geometry.inlier_matches)
-    enough = max(_SURE_INLIERS, _ENOUGH_OF_USUAL * float(np.median(across)))
+    in_video = across[np.diff(image_set.sequence) == 0]
+    usual = float(np.median(in_video)) if len(in_video) else 0.0
+    enough = max(_SURE_INLIERS, _ENOUGH_OF_USUAL * usual)
     confirmed = suspect.maybe & (is_wrong | (across < enough))
     wrong_probes = [int(image_set.sequence[gap]) for gap in suspect.probes if is_wrong[gap]]
     for sequence, count in enumerate(
