@@ -28,8 +28,10 @@ from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.match import MatchReport, match
 from colmap_av1.matching.features.retrieval import similar_images
 from colmap_av1.matching.features.sift import Features, extract_features, match_features
+from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.links.matching import Links
-from colmap_av1.matching.links.merging import links_as_tracks
+from colmap_av1.matching.links.merging import links_as_tracks, merge_links
+from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import (
     ImageOptions,
@@ -176,6 +178,30 @@ def test_tracks_of_links_have_one_observation_per_frame(
         assert len(own) >= 2
         assert np.all(np.diff(own) > 0)
     assert len(tracks.xy) == tracks.offsets[-1]
+
+
+def test_inliers_of_merged_links_are_among_the_matches() -> None:
+    """A link replaces the match of a track that is an outlier."""
+    xy = np.array([[10.0, 10.0], [50.0, 10.0]], np.float32)
+    keypoints = [ImageKeypoints(frame, xy, np.arange(2)) for frame in range(2)]
+    pair, same = np.array([[0, 1]], np.int32), np.array([[0, 0], [1, 1]], np.uint32)
+    tracks = TwoViewGeometry(TwoViewConfig.CALIBRATED, same[:1])
+    matched = MatchedImages(keypoints, pair, [same], [tracks], False)
+    features = {
+        image: Features(np.array(at, np.float32), np.zeros((2, 128), np.float32))
+        for image, at in enumerate(([[50.3, 10.0], [90.0, 10.0]], [[70.0, 10.0], [95.0, 10.0]]))
+    }
+    links = Links(pair, [TwoViewGeometry(TwoViewConfig.CALIBRATED, same)])
+    merged = merge_links(matched, links, features, [])
+    places = [
+        [
+            np.hstack([own.xy[row] for own, row in zip(merged.keypoints, match, strict=True)])
+            for match in rows
+        ]
+        for rows in (merged.geometries[0].inlier_matches, merged.matches[0])
+    ]
+    assert np.allclose(places[0], [[10, 10, 10, 10], [50, 10, 70, 10], [90, 10, 95, 10]])
+    assert np.allclose(places[1], places[0])
 
 
 @pytest.fixture(scope="module")

@@ -102,10 +102,12 @@ def _joined_matches(
     link_matches: NDArray[np.uint32],
     link: TwoViewGeometry,
 ) -> tuple[NDArray[np.uint32], TwoViewGeometry]:
-    """Join the matches of tracks and of a link; keep the geometry that has more inliers."""
+    """Join the matches of tracks and of a link; keep the geometry that has more inliers.
+
+    A keypoint has one match per image. Inliers take precedence, and tracks before links.
+    """
 
     def joined(a: NDArray[np.uint32], b: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        # A keypoint has one match per image; the match of its track takes precedence.
         free = ~np.isin(b[:, 0], a[:, 0]) & ~np.isin(b[:, 1], a[:, 1])
         return np.concatenate([a, b[free]])
 
@@ -113,7 +115,8 @@ def _joined_matches(
     if geometry.config == TwoViewConfig.DEGENERATE:
         leading = link
     inliers = joined(geometry.inlier_matches, link.inlier_matches)
-    return joined(matches, link_matches), replace(leading, inlier_matches=inliers)
+    every = joined(joined(inliers, matches), link_matches)
+    return every, replace(leading, inlier_matches=inliers)
 
 
 def links_as_tracks(
