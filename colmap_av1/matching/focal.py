@@ -97,6 +97,8 @@ def estimate_focal_length(
             xa, xb = xa[middle], xb[middle]
             if len(xa) < _MIN_MATCHES:
                 continue
+        if _are_on_line(xa) or _are_on_line(xb):
+            continue
         views.append((xa, xb))
     if len(views) < _MIN_PAIRS:
         return None
@@ -136,6 +138,12 @@ def estimate_focal_length(
     if not risen or abs(np.diff(np.array(halves, dtype=np.float64))[0]) > math.log(_MAX_FACTOR):
         return None
     return math.exp(found)
+
+
+def _are_on_line(x: _Floats) -> bool:
+    """Whether points, in pixels, lie on a line, so that they determine no pose."""
+    across = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)[1]
+    return bool(across < math.sqrt(len(x)))
 
 
 def _as_pinhole(x: _Floats, focal_length: float) -> _Floats:

@@ -114,7 +114,8 @@ def covisible_pairs(
 
     image = np.repeat(np.arange(len(keypoints)), [len(k.track) for k in keypoints])
     track = np.concatenate([k.track for k in keypoints])
-    seen = csr_array((np.ones(len(track), np.int32), (image, track)))
+    shape = (len(keypoints), int(track.max(initial=-1)) + 1)
+    seen = csr_array((np.ones(len(track), np.int32), (image, track)), shape=shape)
     shared = (seen @ seen.T).tocoo()
     first, second = shared.coords
     kept = (first < second) & (shared.data >= min_matches)

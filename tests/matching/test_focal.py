@@ -59,5 +59,23 @@ def test_still_camera_gives_no_focal_length() -> None:
     assert estimate(replace(tracks, xy=xy)) is None
 
 
+def test_pair_whose_matches_lie_on_a_line_is_ignored() -> None:
+    """They determine no pose, for example the matches of a news ticker."""
+    tracks = replace(walk(), num_frames=NUM_FRAMES + 2)
+    rng = np.random.default_rng(0)
+    x = np.repeat(rng.uniform(0, WIDTH - 50, 100), 2)
+    x[1::2] += rng.uniform(0, 50, 100)
+    on_line = replace(
+        tracks,
+        offsets=np.arange(0, 201, 2),
+        frame=np.tile([NUM_FRAMES, NUM_FRAMES + 1], 100).astype(np.int32),
+        xy=np.column_stack([x, np.full(200, HEIGHT / 2)]).astype(np.float32),
+        sigma=np.full(200, 0.1, np.float32),
+        confirmed=np.zeros(200, np.bool_),
+    )
+    found = estimate(Tracks.concatenate(tracks, on_line))
+    assert found == pytest.approx(FOCAL, rel=0.04)
+
+
 def test_too_few_matches_give_no_focal_length() -> None:
     assert estimate(walk(num_points=40)) is None

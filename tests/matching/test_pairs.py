@@ -10,7 +10,13 @@ from image_sets import tracks_from
 from synthetic_scene import make_scene
 
 from colmap_av1.errors import ImageError
-from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
+from colmap_av1.matching.pairs import (
+    ImageKeypoints,
+    covisible_pairs,
+    image_keypoints,
+    pair_matches,
+    schedule_pairs,
+)
 from colmap_av1.options import PairOptions
 
 
@@ -98,6 +104,11 @@ def test_schedule_without_growth_uses_the_offsets() -> None:
     pairs = schedule_pairs(images, PairOptions(offsets=(3, 1), growth=1.0))
     expected = [(i, j) for i, j in combinations(range(12), 2) if j - i in (1, 3)]
     assert pairs.tolist() == [list(p) for p in expected]
+
+
+def test_images_without_tracks_have_no_pairs() -> None:
+    images = images_seeing([[], [], []])
+    assert len(covisible_pairs(images, 1)) == len(schedule_pairs(images)) == 0
 
 
 def test_scene_pairs_share_tracks() -> None:
