@@ -79,7 +79,8 @@ def image_findings(images: Images, cameras: dict[int, pycolmap.Camera]) -> Itera
             f"{unknown} of {len(cameras)} cameras have no focal length prior: the stored value is "
             "only where the mappers start",
         )
-    sizes = {(c.width, c.height) for i, c in cameras.items() if i in set(images.camera_ids)}
+    used = set(images.camera_ids)
+    sizes = {(c.width, c.height) for i, c in cameras.items() if i in used}
     if len(sizes) > 1:
         yield Finding("note", f"images have {len(sizes)} sizes")
     if images.names != sorted(images.names):

@@ -409,7 +409,8 @@ def _warnings(
             f"separately: {parts}; a mapper makes a model of each, not always the largest first"
         )
     num_images = len(image_set.sequence)
-    is_matched = np.isin([image_set.images.frame_of[name] for name in left], others.frame)
+    frame_of = image_set.images.frame_of
+    is_matched = np.isin([frame_of[name] for name in left], others.frame)
     matched = [name for name, own in zip(left, is_matched, strict=True) if own]
     alone = [name for name, own in zip(left, is_matched, strict=True) if not own]
     if matched:

@@ -135,11 +135,12 @@ def pairs_between(
         return set()
     sequence = image_set.sequence[present]
     allowed = sequence[:, None] != sequence
-    pairs = np.argwhere(np.triu(allowed)).tolist()
-    if len(pairs) > _MAX_EXHAUSTIVE_PAIRS:
+    if np.count_nonzero(allowed) > 2 * _MAX_EXHAUSTIVE_PAIRS:
         pairs = similar_images(
             [features[i] for i in present.tolist()], allowed, options.link_candidates, seed=seed
         ).tolist()
+    else:
+        pairs = np.argwhere(np.triu(allowed)).tolist()
     return {(int(present[a]), int(present[b])) for a, b in pairs}
 
 
