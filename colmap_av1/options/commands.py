@@ -197,6 +197,7 @@ class DensifyOptions(Options):
             "camera",
             "density",
             "pairs",
+            "links",
             "verify",
             "on_existing",
             "run.seed",
