@@ -42,6 +42,7 @@ from colmap_av1.options import (
     ImageOptions,
     LinkOptions,
     MatchOptions,
+    PlaceOptions,
     ReconstructOptions,
 )
 from colmap_av1.poses.mapper import map_poses
@@ -371,8 +372,12 @@ def test_reconstruct_joins_videos_and_photos_in_one_model(
 def test_unconnected_videos_become_models_in_separate_folders(
     halves: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    apart = ReconstructOptions(match=MatchOptions(links=LinkOptions(links="none")))
+    # The distance is known in the first model only.
+    distance = PlaceOptions(scale="2=back/frame_000000.jpg,back/frame_000010.jpg")
+    match_options = MatchOptions(links=LinkOptions(links="none"))
+    apart = ReconstructOptions(match=match_options, place=distance)
     made = reconstruct(halves, tmp_path / "out", options=apart)
+    assert made.place.units == "metres"
     (further,) = made.other_models
     assert (made.num_registered, further.num_registered) == (len(FIRST), len(SECOND))
     assert sorted(made.registered.values()) == [0, len(FIRST)]

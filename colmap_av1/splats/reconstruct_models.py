@@ -81,7 +81,13 @@ def further_models(
     for own in further_poses(run, first, image_set, tracks, map_again=True):
         index = np.searchsorted(image_set.images.frames, own.image_set.images.frames)
         assert run.positions is not None
-        placing = replace(own.run, positions=run.positions.some(index))
+        # The known distance is between points of the first model.
+        place = replace(own.run.options.place, scale=None)
+        placing = replace(
+            own.run,
+            options=replace(own.run.options, place=place),
+            positions=run.positions.some(index),
+        )
         model = written_model(placing, own.posed, own.image_set)[1].result
         placed = read_posed_images(own.run, own.posed.last, own.image_set)
         names = [image.name for image in placed.images]
