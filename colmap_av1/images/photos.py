@@ -109,11 +109,13 @@ def read_photos(folder: Path, files: Sequence[Path], label: str, *, flat: bool) 
         path = folder / file
         name = str(PurePosixPath(label, _flat(file) if flat else file.as_posix()))
         check_name(name)
-        if name in names:
+        # Masks for trainers are PNG files with the name of the image.
+        key = str(PurePosixPath(name).with_suffix("")) if flat else name
+        if key in names:
             raise ImageError(
-                f"{path} and {folder / names[name]} would both be image '{name}': rename one"
+                f"{path} and {folder / names[key]} would both be image '{key}': rename one"
             )
-        names[name] = file
+        names[key] = file
         size = image_size(path)
         bitmap = pycolmap.Bitmap.read(path, as_rgb=False)
         if bitmap is None or _is_cut_short(path):

@@ -179,6 +179,16 @@ def test_image_names_must_be_utf_8(tmp_path: Path) -> None:
     assert photo.name == "photos/_.png"
 
 
+def test_photos_whose_masks_would_have_one_name_are_refused(tmp_path: Path) -> None:
+    """Masks for trainers are PNG files with the name of the image."""
+    files = [Path("a.jpg"), Path("a.png")]
+    for file in files:
+        write_image(tmp_path / file, np.zeros((8, 8, 3), dtype=np.uint8))
+    assert len(read_photos(tmp_path, files, "photos", flat=False)) == 2
+    with pytest.raises(ImageError, match="rename"):
+        read_photos(tmp_path, files, "photos", flat=True)
+
+
 def test_only_photos_that_are_cut_short_are_refused(tmp_path: Path) -> None:
     """A thumbnail in the header and a video after the image may have any markers of JPEG."""
     picture = np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)
