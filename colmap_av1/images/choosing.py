@@ -400,11 +400,19 @@ def _at_steps(names: Sequence[str], num_frames: int, options: ImageOptions) -> N
     """The frames of existing images if every `every`-th frame is an image."""
     step = options.every or 1
     numbers = list(range(len(names)))
+    found = [last_number(name) for name in names]
     if options.first_number is not None:
-        found = [last_number(name) for name in names]
         if None in found:
             raise ImageError(f"'{names[found.index(None)]}' has no number: leave out first_number")
         numbers = [(n or 0) - options.first_number for n in found]
+    elif None not in found:
+        # Where a model does not register an image, the others keep their numbers.
+        steps = np.diff([n or 0 for n in found])
+        if len(steps) and steps.min() == 1 < steps.max():
+            raise ImageError(
+                f"no image has a number between '{names[int(steps.argmax())]}' and the next: give "
+                "first_number, the number of the video's first frame"
+            )
     for name, number in zip(names, numbers, strict=True):
         if not 0 <= number * step < num_frames:
             raise ImageError(
