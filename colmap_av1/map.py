@@ -18,13 +18,14 @@ from colmap_av1.check.model import check_model
 from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_images, read_pose_priors
-from colmap_av1.errors import DatabaseError, ImageError, ModelError, cannot_write
+from colmap_av1.errors import DatabaseError, ImageError, ModelError, OptionError, cannot_write
 from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
 from colmap_av1.matching.few_matches import few_matches_warning
 from colmap_av1.options import MapOptions, PlaceOptions
+from colmap_av1.options.place import parse_distance
 from colmap_av1.poses.long_range import LongRangeErrors
 from colmap_av1.poses.mapper import map_poses
 from colmap_av1.poses.placing.placement import (
@@ -96,7 +97,8 @@ def map_database(
             of the model in folder 0.
         options: the mapper and its options.
         place: how to place the model in folder 0 in the world. Positions are the pose priors of
-            the database.
+            the database. A model that cannot be placed keeps the mapper's coordinates, with a
+            warning.
         progress: called with a stage's name, the amount of work done, and the total if known.
         overwrite: replace an output that has models and nothing else.
 
@@ -105,8 +107,8 @@ def map_database(
         ImageError: an image of the database is missing from the folder, or the first one differs in
             size.
         ModelError: the mapper fails or finds no model; the message names its log.
-        OptionError: the output is not empty and must not be replaced, or the known distance does
-            not fit the model.
+        OptionError: the output is not empty and must not be replaced, or the database lacks an
+            image of the known distance.
 
     Examples:
         >>> from colmap_av1 import map_database
@@ -119,7 +121,7 @@ def map_database(
     database, image_path, output = Path(database), Path(image_path), Path(output)
     clock = Clock()
     check_new_folder(output, MODEL_FILES, [database, image_path], overwrite=overwrite)
-    checked = _check_input(database, image_path)
+    checked = _check_input(database, image_path, place)
 
     try:
         with _log() as log, whole_folder(output, overwrite=overwrite) as partial:
@@ -134,7 +136,13 @@ def map_database(
                     f"{log}, try the other --mapper, or give --camera_params when matching"
                 )
             with clock.measure("place"):
-                placement = _place(partial, database, image_path, place, options.seed)
+                try:
+                    placement = _place(partial, database, image_path, place, options.seed)
+                except (ImageError, OptionError) as error:  # The model is valid without a place.
+                    placement = Placement(
+                        warnings=(f"the model keeps the mapper's coordinates: {error}",)
+                    )
+                write_place(partial, placement)
     except OSError as error:
         raise ModelError(cannot_write(output, error)) from error
     model = read_model(output / "0")
@@ -249,7 +257,7 @@ def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:
 def _place(
     output: Path, database: Path, image_path: Path, options: PlaceOptions, seed: int
 ) -> Placement:
-    """Place the model in folder 0 of the output in the world, and write `place.json`."""
+    """Place the model in folder 0 of the output in the world."""
     folder = output / "0"
     model = read_model(folder)
     images = [*posed_images(model).values()]
@@ -270,12 +278,11 @@ def _place(
     if found.is_moved:
         model.transform(found.similarity)
         model.write_binary(folder)
-    write_place(output, found)
     return found
 
 
-def _check_input(database: Path, image_path: Path) -> DatabaseCheck:
-    """Refuse inputs that make a mapper fail."""
+def _check_input(database: Path, image_path: Path, place: PlaceOptions) -> DatabaseCheck:
+    """Refuse inputs that make a mapper fail, and a known distance of other images."""
     checked = check_database(database)
     if not checked.depth.is_observable:
         raise DatabaseError(f"{database}: {checked.depth.warning}")
@@ -293,6 +300,15 @@ def _check_input(database: Path, image_path: Path) -> DatabaseCheck:
         raise ImageError(
             f"{missing}: is missing, but in the database: give the folder of its images"
         )
+    if place.scale is not None:
+        names = {image.name for image in images}
+        marks = [mark for end in parse_distance(place.scale).ends for mark in end.marks]
+        other = next((mark.image for mark in marks if mark.image not in names), None)
+        if other is not None:
+            raise OptionError(
+                f"scale: the database has no image '{other}': give its images, such as "
+                f"{images[0].name}"
+            )
     size, wanted = image_size(files[0]), (images[0].width, images[0].height)
     if size != wanted:
         raise ImageError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -28,6 +29,7 @@ from colmap_av1 import (
     MatchOptions,
     ModelError,
     OptionError,
+    PlaceOptions,
     VerifyOptions,
     map_database,
     match,
@@ -129,6 +131,32 @@ def test_second_model_of_the_same_images_is_reported(
     assert any("again" in warning for warning in report.warnings)
 
 
+def test_model_that_cannot_be_placed_keeps_the_coordinates_of_the_mapper(
+    database: Path,
+    images: Path,
+    made: ReconstructReport,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The images of the distance are not registered, and those of the model are not readable."""
+    mapped_model = made.output / "sparse" / "0"
+
+    def mapped(_: Path, output: Path, *__: object, log: Path, **___: object) -> tuple[int]:
+        shutil.copytree(mapped_model, output / "0")
+        log.touch()
+        return (NUM_IMAGES,)
+
+    monkeypatch.setattr("colmap_av1.map.map_poses", mapped)
+    distance = PlaceOptions(scale="2=frame_000000.png,frame_000003.png")
+    for place in (distance, PlaceOptions(upright=True)):
+        output = tmp_path / "model"
+        report = map_database(database, images, output, place=place, overwrite=True)
+        assert any("coordinates" in warning for warning in report.warnings)
+        assert json.loads((output / "place.json").read_text())["scale"] == 1
+        points = [(folder / "points3D.bin").read_bytes() for folder in (mapped_model, report.model)]
+        assert points[0] == points[1]
+
+
 def test_intrinsics_are_kept_or_refined(database: Path, images: Path, tmp_path: Path) -> None:
     def focal_lengths(report: MapReport) -> tuple[float, float]:
         """The focal length of the database, and that of the model."""
@@ -213,6 +241,9 @@ def test_bad_databases_and_folders_are_reported(
         cv2.imwrite(str(tmp_path / "some" / path.name), np.zeros((8, 16, 3), np.uint8))
     with pytest.raises(ImageError, match="16x8"):
         map_database(database, tmp_path / "some", output)
+    typo = PlaceOptions(scale="2=frame_000000.png,typo.png")
+    with pytest.raises(OptionError, match="typo"):
+        map_database(database, tmp_path / "some", output, place=typo)
     assert not list(tmp_path.glob("*model*"))
     with pytest.raises(OptionError, match="not empty"):
         map_database(database, images, tmp_path / "some")
