@@ -312,7 +312,7 @@ def _write(
     overwrite: bool,
 ) -> None:
     try:
-        with whole_folder(output, overwrite=overwrite) as partial:
+        with whole_folder(output, MODEL_FILES if overwrite else None) as partial:
             write_model(partial, cameras, images, points)
     except OSError as error:
         raise ModelError(cannot_write(output, error)) from error

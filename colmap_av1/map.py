@@ -123,8 +123,9 @@ def map_database(
     check_new_folder(output, MODEL_FILES, [database, image_path], overwrite=overwrite)
     checked = _check_input(database, image_path, place)
 
+    own = MODEL_FILES if overwrite else None
     try:
-        with _log() as log, whole_folder(output, overwrite=overwrite) as partial:
+        with _log() as log, whole_folder(output, own) as partial:
             with clock.measure("poses"):
                 num_registered, forward = _map(
                     checked, image_path, partial, options, log=log, progress=progress

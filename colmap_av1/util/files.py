@@ -82,8 +82,7 @@ def check_new_folder(
     if path.is_dir() and any(path.iterdir()):
         if not overwrite:
             raise OptionError(f"{path}: is not empty: give a new folder, or --overwrite")
-        held = (p.relative_to(path).as_posix() for p in path.rglob("*") if not _is_folder(p))
-        other = next((name for name in held if not own.fullmatch(name)), None)
+        other = _other_file(path, own)
         if other is not None:
             raise OptionError(
                 f"{path}: contains {other}, which is never replaced: give a new folder"
@@ -141,31 +140,32 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
+def whole_folder(path: Path, own: re.Pattern[str] | None = None) -> Iterator[Path]:
     """Like `whole_file` for a folder that is missing or empty; its parents are created.
 
     Args:
         path: the folder.
-        overwrite: replace the content of a folder that is not empty, see `check_new_folder`. If
-            the process is killed while it does so, `remove_leftovers` restores the old or the new
-            content.
+        own: pattern of paths in a folder that is not empty, which are replaced; None: the folder
+            is not replaced. If the process is killed while it replaces them, `remove_leftovers`
+            restores the old or the new content.
 
     Yields:
         The hidden folder to write to.
 
     Raises:
-        OSError: the folder cannot be created or renamed.
+        OSError: the folder cannot be created or renamed, or it contains other files at the end of
+            the body. The new content is then kept in a folder next to it, which the message names.
     """
     path = path.resolve()
     with _hidden_folder(path) as partial:
         yield partial
-        if not path.exists():
-            partial.replace(path)
-        elif any(path.iterdir()) and not overwrite:
-            raise OSError(errno.ENOTEMPTY, os.strerror(errno.ENOTEMPTY), str(path))
-        else:  # the folder itself stays, because it may be the user's current folder
-            with held_back():
-                _exchange(path, partial)
+        try:
+            _put(partial, path, own)
+        except OSError as error:  # the new content may be the work of hours
+            kept = partial.with_name(partial.stem[1:])
+            partial.rename(kept)
+            reason = f"{error.strerror}, the new content is in {kept}"
+            raise OSError(error.errno, reason, str(path)) from error
 
 
 @contextmanager
@@ -206,6 +206,24 @@ def remove_leftovers(folder: Path, name: str | None = None) -> None:
         with _left(path) as is_left, contextlib.suppress(OSError):
             if is_left:
                 shutil.rmtree(path) if _is_folder(path) else path.unlink()
+
+
+def _put(partial: Path, path: Path, own: re.Pattern[str] | None) -> None:
+    """Move a hidden folder to its place, unless another program wrote there meanwhile."""
+    if not path.exists():
+        partial.replace(path)
+        return
+    other = next((p.name for p in path.iterdir()), None) if own is None else _other_file(path, own)
+    if other is not None:
+        raise OSError(errno.EEXIST, f"another program wrote {other} meanwhile", str(path))
+    with held_back():  # the folder itself stays, because it may be the user's current folder
+        _exchange(path, partial)
+
+
+def _other_file(folder: Path, own: re.Pattern[str]) -> str | None:
+    """A file in a folder whose path does not match a pattern."""
+    held = (p.relative_to(folder).as_posix() for p in folder.rglob("*") if not _is_folder(p))
+    return next((name for name in held if not own.fullmatch(name)), None)
 
 
 def _exchange(path: Path, partial: Path) -> None:

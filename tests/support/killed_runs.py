@@ -17,7 +17,7 @@ with getattr(files, sys.argv[1])(Path(sys.argv[2])) as partial:
     os.kill(os.getpid(), signal.SIGKILL)
 """
 _WHILE_REPLACING = """
-import os, signal, sys
+import os, re, signal, sys
 from pathlib import Path
 from colmap_av1.util.files import whole_folder
 left = int(sys.argv[2])
@@ -29,7 +29,7 @@ def counted(call):
             os.kill(os.getpid(), signal.SIGKILL)
         return call(*args, **how)
     return counting
-with whole_folder(Path(sys.argv[1]), overwrite=True) as partial:
+with whole_folder(Path(sys.argv[1]), re.compile(".*")) as partial:
     for name in ("a", "c"):
         (partial / name).write_text("new")
     for name in ("mkdir", "rename", "rmdir", "replace"):

@@ -26,6 +26,7 @@ from colmap_av1.util.files import (
 from colmap_av1.util.stages import open_stages
 
 locks = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such file locks")
+ANY = re.compile(".*")
 
 
 def names_in(folder: Path) -> list[str]:
@@ -89,9 +90,6 @@ def test_folder_appears_when_complete(tmp_path: Path) -> None:
         assert not output.exists()
     assert (output / "points").read_text() == "1"
     assert list(output.parent.iterdir()) == [output]
-    with pytest.raises(OSError, match="not empty"), whole_folder(output) as partial:
-        (partial / "points").write_text("2")
-    assert (output / "points").read_text() == "1"
     with pytest.raises(KeyError), whole_folder(tmp_path / "other") as partial:
         {}[(partial / "points").write_text("2")]
     assert [p.name for p in tmp_path.iterdir()] == ["new"]
@@ -117,13 +115,13 @@ def test_existing_folder_is_filled(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("model")
     number = output.stat().st_ino
     for content in ("1", "2"):
-        with whole_folder(tmp_path / "link", overwrite=content == "2") as partial:
+        with whole_folder(tmp_path / "link", ANY if content == "2" else None) as partial:
             (partial / f"points{content}").write_text(content)
             (partial / "0").mkdir()
         assert sorted(p.name for p in output.iterdir()) == ["0", f"points{content}"]
     assert output.stat().st_ino == number
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "model"]
-    with pytest.raises(KeyError), whole_folder(output, overwrite=True) as partial:
+    with pytest.raises(KeyError), whole_folder(output, ANY) as partial:
         {}[(partial / "points3").write_text("3")]
     assert (output / "points2").read_text() == "2"
 
@@ -146,7 +144,7 @@ def test_interrupted_exchange_keeps_the_old_content(
         return move(entry, target)
 
     def replace_content() -> None:
-        with whole_folder(output, overwrite=True) as partial:
+        with whole_folder(output, ANY) as partial:
             for name in ("0", "1", "2", "3"):
                 (partial / name).write_text("new")
             monkeypatch.setattr(Path, "replace", interrupted)
@@ -174,6 +172,32 @@ def test_file_written_meanwhile_by_another_program_is_kept(tmp_path: Path, is_th
         write_both()
     assert output.read_text() == "theirs"
     assert names_in(tmp_path) == ["a.mp4"]
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+@pytest.mark.parametrize("own", [None, re.compile("points")])
+def test_folder_written_meanwhile_by_another_program_is_kept_like_the_new_content(
+    tmp_path: Path, is_there: bool, own: re.Pattern[str] | None
+) -> None:
+    output = tmp_path / "model"
+    if is_there:
+        output.mkdir()
+        (output / "points").write_text("old")
+
+    def write_both() -> None:
+        with whole_folder(output, own) as partial:
+            (partial / "points").write_text("new")
+            (output / "checkpoints").mkdir(parents=True)
+            (output / "checkpoints" / "30000.ckpt").touch()
+
+    with pytest.raises(FileExistsError, match="meanwhile") as refused:
+        write_both()
+    assert (output / "checkpoints" / "30000.ckpt").exists()
+    assert not is_there or (output / "points").read_text() == "old"
+    (kept,) = {*names_in(tmp_path)} - {"model"}
+    assert kept in str(refused.value)
+    remove_leftovers(tmp_path)
+    assert (tmp_path / kept / "points").read_text() == "new"
 
 
 @locks
