@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from colmap_av1.errors import OptionError
+from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.signals import held_back
 
 try:
@@ -73,8 +73,8 @@ def check_new_folder(
         overwrite: allow replacing a folder that contains only such paths.
 
     Raises:
-        OptionError: the folder exists and must not be replaced, contains an input, or cannot be
-            created.
+        OptionError: the folder exists and must not be replaced, contains an input, is a mount
+            point, or cannot be created.
     """
     if path.exists() and not path.is_dir():
         raise OptionError(f"{path}: is a file: give a new folder")
@@ -89,6 +89,22 @@ def check_new_folder(
             )
     check_apart(path, inputs)
     check_creatable(path.resolve())
+    if path.is_dir():
+        _check_movable(path.resolve())
+
+
+def _check_movable(path: Path) -> None:
+    """Check that a hidden folder next to a folder can be moved into it.
+
+    A bind mount has the device number of the folder above it, so only a move shows it.
+    """
+    try:
+        with held_back(), _hidden_folder(path) as probe:
+            probe.rename(path / probe.name).rename(probe)
+    except OSError as error:
+        if error.errno == errno.EXDEV:
+            raise OptionError(f"{path}: is a mount point: give a folder inside it") from error
+        raise OptionError(cannot_write(path, error)) from error
 
 
 def check_creatable(path: Path) -> None:

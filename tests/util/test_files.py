@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import re
 import sys
@@ -290,6 +291,23 @@ def test_folder_with_other_files_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "model" / "notes.txt").touch()
     with pytest.raises(OptionError, match=r"notes.txt"):
         check_new_folder(tmp_path / "model", own, overwrite=True)
+
+
+def test_mount_point_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rename = Path.rename
+
+    def on_mounts(source: Path, target: Path) -> Path:
+        if source.parent != target.parent:
+            raise OSError(errno.EXDEV, os.strerror(errno.EXDEV))
+        return rename(source, target)
+
+    (tmp_path / "out").mkdir()
+    check_new_folder(tmp_path / "out", ANY)
+    monkeypatch.setattr(Path, "rename", on_mounts)
+    check_new_folder(tmp_path / "out" / "new", ANY)
+    with pytest.raises(OptionError, match="mount"):
+        check_new_folder(tmp_path / "out", ANY)
+    assert [*tmp_path.rglob("*")] == [tmp_path / "out"]
 
 
 @locks
