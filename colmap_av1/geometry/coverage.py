@@ -27,6 +27,10 @@ _AROUND = 8
 _MOST_IMAGES = 64
 # Number of points on each side of the image that bound the camera's field of view.
 _EDGE_POINTS = 33
+# Largest distance in pixels between a pixel and the projection of its ray.
+_SAME_PIXEL = 1.0
+# Largest distance between a point and the ray of its projection, relative to the point's distance.
+_SAME_RAY = 1e-3
 
 
 @dataclass(frozen=True)
@@ -66,8 +70,27 @@ class PosedCamera:
         return np.asarray(kept.reshape(rows, CELL, columns, CELL).any(axis=(1, 3)))
 
     @functools.cached_property
-    def _seen_rays(self) -> tuple[_Floats, _Floats]:
-        return _seen_rays(self.camera)
+    def _seen_rays(self) -> tuple[_Floats, _Floats] | None:
+        """Smallest and largest (x / z, y / z) on the edge of the image, with a margin of 1 %.
+
+        None if a point of the edge has no ray.
+        """
+        along = np.linspace(0.0, 1.0, _EDGE_POINTS)
+        none, all_ = np.zeros_like(along), np.ones_like(along)
+        edge = [(along, none), (along, all_), (none, along), (all_, along)]
+        xy = np.concatenate([np.column_stack(side) for side in edge]) * self.size
+        if not self._have_rays(xy).all():
+            return None
+        rays = self.rays(xy)[:, :2]
+        low, high = rays.min(axis=0), rays.max(axis=0)
+        margin = 0.01 * (high - low)
+        return low - margin, high + margin
+
+    def _have_rays(self, xy: _Floats) -> NDArray[np.bool_]:
+        """Whether a ray with z > 0 is known for pixels [n, 2]."""
+        # COLMAP gives NaN or the ray of another pixel for those without one.
+        again = np.asarray(self.camera.img_from_cam(self.rays(xy))).reshape(-1, 2)
+        return np.asarray(np.linalg.norm(again - xy, axis=1) <= _SAME_PIXEL)
 
     def keeps(self, xy: _Floats) -> NDArray[np.bool_]:
         """Whether pixels [n, 2] of the image are valid."""
@@ -97,10 +120,15 @@ class PosedCamera:
                 pose, np.asarray(self.camera.params), float(width), float(height), xyz
             )
         # Outside the field of view, the distortion model may project points into the image.
-        index, own = _core.points_in_view(pose, *self._seen_rays, xyz)
+        low, high = self._seen_rays or (np.full(2, -np.inf), np.full(2, np.inf))
+        index, own = _core.points_in_view(pose, low, high, xyz)
         xy = np.asarray(self.camera.img_from_cam(own)).reshape(-1, 2)
         x, y = xy[:, 0], xy[:, 1]
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        if self._seen_rays is None:
+            seen = own[inside]
+            apart = np.linalg.norm(self.rays(xy[inside]) * seen[:, 2:] - seen, axis=1)
+            inside[inside] = apart <= _SAME_RAY * np.linalg.norm(seen, axis=1)
         return index[inside], xy[inside], own[inside, 2]
 
 
@@ -186,17 +214,3 @@ def without_gaps(grid: _Floats) -> _Floats:
         for column in range(3):
             nearer += padded[row : row + rows, column : column + columns] < limit
     return np.where(nearer >= _AROUND - 1, np.inf, grid)
-
-
-def _seen_rays(camera: pycolmap.Camera) -> tuple[_Floats, _Floats]:
-    """Smallest and largest (x / z, y / z) on the edge of the image, with a margin of 1 %."""
-    width, height = float(camera.width), float(camera.height)
-    along = np.linspace(0.0, 1.0, _EDGE_POINTS)
-    none, all_ = np.zeros_like(along), np.ones_like(along)
-    edge = [(along, none), (along, all_), (none, along), (all_, along)]
-    xy = np.concatenate([np.column_stack([x * width, y * height]) for x, y in edge])
-    rays = np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
-    rays = rays[np.isfinite(rays).all(axis=1)]
-    low, high = rays.min(axis=0), rays.max(axis=0)
-    margin = 0.01 * (high - low)
-    return low - margin, high + margin

@@ -16,6 +16,20 @@ PLAIN = pycolmap.Camera(
 BENT = pycolmap.Camera(
     camera_id=2, model="SIMPLE_RADIAL", width=SIZE[0], height=SIZE[1], params=[100, 80, 48, -0.1]
 )
+# Lenses whose distortion gives some or all pixels at the image edge no ray.
+NO_CORNERS = pycolmap.Camera(
+    camera_id=3, model="SIMPLE_RADIAL", width=SIZE[0], height=SIZE[1], params=[96, 80, 48, -0.2]
+)
+NO_EDGE = pycolmap.Camera(
+    camera_id=4, model="SIMPLE_RADIAL", width=SIZE[0], height=SIZE[1], params=[62, 80, 48, -0.5]
+)
+CIRCLE = pycolmap.Camera(
+    camera_id=5,
+    model="OPENCV_FISHEYE",
+    width=SIZE[0],
+    height=SIZE[1],
+    params=[22, 22, 80, 48, -0.05, 0, 0, 0],
+)
 HERE = np.column_stack([np.eye(3), np.zeros(3)])
 NUM_CELLS = SIZE[0] // CELL * SIZE[1] // CELL
 
@@ -92,3 +106,17 @@ def test_projection_gives_pixels_and_depths() -> None:
     grid = nearest_depth(view, points)
     assert grid.shape == (6, 10)
     assert np.sort(grid.ravel())[:3].tolist() == [2.0, 5.0, np.inf]
+
+
+@pytest.mark.parametrize("camera", [NO_CORNERS, NO_EDGE, CIRCLE])
+def test_lens_without_rays_at_the_image_edge_sees_exactly_the_points_on_its_rays(
+    camera: pycolmap.Camera,
+) -> None:
+    view = PosedCamera(camera, HERE)
+    xyz = np.random.default_rng(1).uniform((-6, -6, -1), (6, 6, 6), (5000, 3))
+    index, xy, depth = view.project(xyz)
+    # The distortion folds no other points into the image, and no point near the axis is lost.
+    assert np.allclose(view.rays(xy) * depth[:, None], xyz[index], atol=0.01)
+    near = np.flatnonzero((xyz[:, 2] > 0) & (np.abs(xyz[:, :2]) < 0.4 * xyz[:, 2:]).all(axis=1))
+    assert len(near) > 100
+    assert np.isin(near, index).all()
