@@ -59,15 +59,18 @@ class PosedCamera:
 
     @property
     def valid_cells(self) -> NDArray[np.bool_]:
-        """Cells of the image that have valid pixels, bool [rows, columns]."""
+        """Cells of the image with valid pixels and a ray in the middle, bool [rows, columns]."""
         width, height = self.size
         rows, columns = -(-height // CELL), -(-width // CELL)
+        y, x = np.mgrid[:rows, :columns].reshape(2, -1) * CELL + CELL / 2
+        middle = np.minimum(np.column_stack([x, y]), self.size)
+        seen = self._have_rays(middle).reshape(rows, columns)
         if self.mask is None:
-            return np.ones((rows, columns), dtype=np.bool_)
+            return seen
         own = [(np.arange(n) + 0.5) * m / n for n, m in zip(self.size, self.mask.size, strict=True)]
         kept = np.zeros((rows * CELL, columns * CELL), dtype=np.bool_)
         kept[:height, :width] = self.mask.kept[np.ix_(own[1].astype(int), own[0].astype(int))]
-        return np.asarray(kept.reshape(rows, CELL, columns, CELL).any(axis=(1, 3)))
+        return np.asarray(seen & kept.reshape(rows, CELL, columns, CELL).any(axis=(1, 3)))
 
     @functools.cached_property
     def _seen_rays(self) -> tuple[_Floats, _Floats] | None:
@@ -79,7 +82,7 @@ class PosedCamera:
         none, all_ = np.zeros_like(along), np.ones_like(along)
         edge = [(along, none), (along, all_), (none, along), (all_, along)]
         xy = np.concatenate([np.column_stack(side) for side in edge]) * self.size
-        if not self._have_rays(xy).all():
+        if not self._on_rays(xy).all():
             return None
         rays = self.rays(xy)[:, :2]
         low, high = rays.min(axis=0), rays.max(axis=0)
@@ -87,14 +90,19 @@ class PosedCamera:
         return low - margin, high + margin
 
     def _have_rays(self, xy: _Floats) -> NDArray[np.bool_]:
-        """Whether a ray with z > 0 is known for pixels [n, 2]."""
+        """Whether pixels [n, 2] of the image have a ray, which is slow to find out."""
+        return np.ones(len(xy), np.bool_) if self._seen_rays else self._on_rays(xy)
+
+    def _on_rays(self, xy: _Floats) -> NDArray[np.bool_]:
+        """Whether pixels [n, 2] are the projections of their rays."""
         # COLMAP gives NaN or the ray of another pixel for those without one.
         again = np.asarray(self.camera.img_from_cam(self.rays(xy))).reshape(-1, 2)
         return np.asarray(np.linalg.norm(again - xy, axis=1) <= _SAME_PIXEL)
 
     def keeps(self, xy: _Floats) -> NDArray[np.bool_]:
-        """Whether pixels [n, 2] of the image are valid."""
-        return np.ones(len(xy), np.bool_) if self.mask is None else self.mask.keeps(xy, self.size)
+        """Whether pixels [n, 2] of the image are valid and have a ray."""
+        seen = self._have_rays(xy)
+        return seen if self.mask is None else seen & self.mask.keeps(xy, self.size)
 
     def rays(self, xy: _Floats) -> _Floats:
         """Rays in camera coordinates of pixels [n, 2], float64 [n, 3] with z = 1."""

@@ -7,6 +7,7 @@ import pycolmap
 import pytest
 
 from colmap_av1.geometry.coverage import CELL, PosedCamera, coverage, nearest_depth
+from colmap_av1.geometry.masks import make_mask
 
 SIZE = (160, 96)
 PLAIN = pycolmap.Camera(
@@ -120,3 +121,15 @@ def test_lens_without_rays_at_the_image_edge_sees_exactly_the_points_on_its_rays
     near = np.flatnonzero((xyz[:, 2] > 0) & (np.abs(xyz[:, :2]) < 0.4 * xyz[:, 2:]).all(axis=1))
     assert len(near) > 100
     assert np.isin(near, index).all()
+
+
+@pytest.mark.parametrize("camera", [NO_CORNERS, NO_EDGE, CIRCLE])
+def test_cells_without_a_ray_are_not_counted(camera: pycolmap.Camera) -> None:
+    view = PosedCamera(camera, HERE)
+    y, x = np.mgrid[0.5 : SIZE[1], 0.5 : SIZE[0]].reshape(2, -1)
+    xy = np.column_stack([x, y])
+    own = view.rays(xy[view.keeps(xy)]) * 3.0
+    assert 0 < len(own) < len(xy)
+    assert len(view.project(own)[0]) == len(own)
+    masked = PosedCamera(camera, HERE, make_mask(np.ones(SIZE[::-1], np.bool_)))
+    assert coverage([view], own) == coverage([masked], own) == 1.0

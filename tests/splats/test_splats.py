@@ -181,6 +181,24 @@ def test_dense_areas_are_thinned_and_holes_are_filled() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL", [191, 160, 120, -0.2]),
+        ("SIMPLE_RADIAL", [125, 160, 120, -0.5]),
+        ("OPENCV_FISHEYE", [95, 95, 160, 120, 0, 0, 0, 0]),
+        ("OPENCV_FISHEYE", [45, 45, 160, 120, -0.05, 0, 0, 0]),
+    ],
+)
+def test_pixels_without_a_ray_get_no_points(model: str, params: list[float]) -> None:
+    lens = pycolmap.Camera(camera_id=1, model=model, width=WIDTH, height=HEIGHT, params=params)
+    views = [PosedCamera(lens, pose) for pose in moving(0.1)]
+    made = splat_cloud(cloud(scattered(3000, 5.0), views), views, None)
+    assert np.isfinite(made.xyz).all()
+    assert (np.diff(made.offsets) >= 1).all()
+    assert coverage(views, made.xyz) > 0.95
+
+
 def test_point_behind_a_filled_hole_leaves_no_hole() -> None:
     """A far point seen through a hole in a near wall is hidden once the hole is filled."""
     views = posed(moving(0.0, 1))
