@@ -25,6 +25,7 @@ from colmap_av1.geometry.track_points import (
     LEAST_AGREEING,
     Colours,
     chaining_for_points,
+    fitting_in_images,
     mean_error,
     seen_in,
     to_model_points,
@@ -179,7 +180,11 @@ def densify(
                 progress=progress,
             )
         agreeing = _agreement(model, points)
-        of_tracks = to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
+        of_tracks = fitting_in_images(
+            to_model_points(points, view, seen.xy[points.observation].astype(np.float64)),
+            views,
+            options.triangulate.max_reprojection_error,
+        )
         with scratch_folder(output) as scratch:
             cloud = _coloured_cloud(
                 of_tracks,

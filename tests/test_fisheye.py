@@ -198,3 +198,9 @@ def test_camera_model_is_kept_by_match_map_and_densify(clip: Clip, tmp_path: Pat
     assert camera.model_name == MODEL
     assert dense.num_points > 3 * dense.num_model_points
     assert dense.mean_error < 0.5
+    made = read_model(dense.output)
+    stored = [point.error for point in made.points3D.values()]
+    made.update_point_3d_errors()
+    true = [point.error for point in made.points3D.values()]
+    assert np.allclose(stored, true, atol=1e-3)
+    assert dense.mean_error == pytest.approx(np.mean(true), abs=1e-3)

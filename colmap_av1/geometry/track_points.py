@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.colmap_model import ModelPoints
+from colmap_av1.geometry.colmap_model import ModelPoints, take_points
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.distant_points import splat_points
 from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
@@ -102,8 +102,9 @@ def triangulate_tracks(
 ) -> TriangulatedPoints:
     """Triangulate all tracks as `options.points` requests.
 
-    Errors are in pixels of the pinhole cameras if given, else of the images' own cameras. `rays` is
-    the result of `rays_of` if already known.
+    Errors are in pixels of the pinhole cameras if given, else of pinhole cameras with the focal
+    lengths of the images' own, see `fitting_in_images`. `rays` is the result of `rays_of` if
+    already known.
     """
     rays = rays_of(tracks, view, cameras) if rays is None else rays
     shown = cameras if pinholes is None else pinholes
@@ -188,14 +189,18 @@ def mean_error(cloud: ModelPoints) -> float:
     return float(cloud.error[cloud.error >= 0].mean())
 
 
-def mean_reprojection_errors(
-    points: ModelPoints, views: Sequence[PosedCamera]
-) -> NDArray[np.float64]:
-    """Mean reprojection error of each point, in pixels of the images with their distortion.
+def fitting_in_images(
+    points: ModelPoints, views: Sequence[PosedCamera], max_error: float
+) -> ModelPoints:
+    """The points that fit the images with their distortion, with their errors in them.
+
+    Triangulation measures errors in pixels of a pinhole camera, which are wrong for rays that a
+    fisheye lens receives from the side or from behind.
 
     Args:
         points: the points.
         views: the images, by the index that observations have.
+        max_error: largest mean reprojection error in pixels.
     """
     lengths = np.diff(points.offsets)
     owner = np.repeat(np.arange(len(lengths)), lengths)
@@ -206,7 +211,8 @@ def mean_reprojection_errors(
         seen = points.xyz[owner[own]] @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
         at = np.asarray(view.camera.img_from_cam(seen)).reshape(-1, 2)
         apart[own] = np.linalg.norm(at - points.xy[own], axis=1)
-    return np.bincount(owner, apart, len(lengths)) / lengths
+    error = np.bincount(owner, apart, len(lengths)) / lengths
+    return take_points(replace(points, error=error), np.flatnonzero(error <= max_error))
 
 
 def to_model_points(

@@ -17,8 +17,8 @@ from colmap_av1.geometry.coverage import PosedCamera, coverage, views_of
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.track_points import (
     Colours,
+    fitting_in_images,
     mean_error,
-    mean_reprojection_errors,
     rays_of,
     seen_in,
     to_model_points,
@@ -79,11 +79,8 @@ def _tracked_points(
         xy = on_pinholes(rays[points.observation], view[points.observation], cameras)
         return to_model_points(points, view, xy), agreeing
     tracked = to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
-    # Triangulation measures errors in pixels of a pinhole camera, which are wrong for rays that a
-    # fisheye lens receives from behind.
-    tracked = replace(tracked, error=mean_reprojection_errors(tracked, views))
-    fit = tracked.error <= run.options.triangulate.max_reprojection_error
-    return take_points(tracked, np.flatnonzero(fit)), agreeing
+    most = run.options.triangulate.max_reprojection_error
+    return fitting_in_images(tracked, views, most), agreeing
 
 
 # Returns the undistortion of an image, given by its index; None if it is written unchanged.
