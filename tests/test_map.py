@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -111,6 +112,18 @@ def test_largest_model_comes_first(database: Path, images: Path, tmp_path: Path)
     assert any("coordinates" in warning for warning in report.warnings)
 
 
+def copying(model: Path, *sizes: int) -> Callable[..., tuple[int, ...]]:
+    """A mapper that writes a model once for each of the sizes that it reports."""
+
+    def mapped(_: Path, output: Path, *__: object, log: Path, **___: object) -> tuple[int, ...]:
+        for number in range(len(sizes)):
+            shutil.copytree(model, output / str(number))
+        log.touch()
+        return sizes
+
+    return mapped
+
+
 def test_second_model_of_the_same_images_is_reported(
     database: Path,
     images: Path,
@@ -119,13 +132,7 @@ def test_second_model_of_the_same_images_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A mapper can start a second model with images that are already registered."""
-
-    def mapped(_: Path, output: Path, *__: object, log: Path, **___: object) -> tuple[int, int]:
-        for number in range(2):
-            shutil.copytree(made.output / "sparse" / "0", output / str(number))
-        log.touch()
-        return NUM_IMAGES, 2
-
+    mapped = copying(made.output / "sparse" / "0", NUM_IMAGES, 2)
     monkeypatch.setattr("colmap_av1.map.map_poses", mapped)
     report = map_database(database, images, tmp_path / "model")
     assert any("again" in warning for warning in report.warnings)
@@ -140,13 +147,7 @@ def test_model_that_cannot_be_placed_keeps_the_coordinates_of_the_mapper(
 ) -> None:
     """The images of the distance are not registered, and those of the model are not readable."""
     mapped_model = made.output / "sparse" / "0"
-
-    def mapped(_: Path, output: Path, *__: object, log: Path, **___: object) -> tuple[int]:
-        shutil.copytree(mapped_model, output / "0")
-        log.touch()
-        return (NUM_IMAGES,)
-
-    monkeypatch.setattr("colmap_av1.map.map_poses", mapped)
+    monkeypatch.setattr("colmap_av1.map.map_poses", copying(mapped_model, NUM_IMAGES))
     distance = PlaceOptions(scale="2=frame_000000.png,frame_000003.png")
     for place in (distance, PlaceOptions(upright=True)):
         output = tmp_path / "model"

@@ -297,7 +297,9 @@ class _Search:
         """The search among the images of one model, after the others are registered."""
         is_own = self._growth.model_of[self._matched.pairs] == number
         found = replace(self._found, count=np.where(is_own.all(axis=1), self._found.count, 0))
-        return _Search(self._matched, self._cameras, found, self._growth)
+        own = _Search(self._matched, self._cameras, found, self._growth)
+        own._known_begun = self._known_begun
+        return own
 
     def first_certain(self) -> tuple[InitialLimits | None, set[int]]:
         """The first limits with which the mapper finds a good pair, and the bad pairs before it.
