@@ -7,6 +7,16 @@ from numpy.typing import NDArray
 
 from colmap_av1.motion.frame_motion import FrameMotion
 
+_TrackArrays = tuple[
+    int,
+    int,
+    int,
+    NDArray[np.int64],
+    NDArray[np.int32],
+    NDArray[np.float32],
+    NDArray[np.float32],
+]
+
 class BitstreamError(Exception): ...
 class LimitError(Exception): ...
 
@@ -59,22 +69,13 @@ class TrackBuilderOptions:
     cells: int
     seeding: int
     observed: list[int] | None
+    ends_of: int
     def __init__(self) -> None: ...
 
 class TrackBuilder:
     def __init__(self, options: TrackBuilderOptions) -> None: ...
     def add(self, frame: FrameMotion) -> None: ...
-    def finish(
-        self,
-    ) -> tuple[
-        int,
-        int,
-        int,
-        NDArray[np.int64],
-        NDArray[np.int32],
-        NDArray[np.float32],
-        NDArray[np.float32],
-    ]: ...
+    def finish(self) -> tuple[_TrackArrays, _TrackArrays]: ...
 
 def select_spread(
     *,

@@ -473,7 +473,7 @@ def _prepare(
             next_to=next_to,
             context=context,
         )
-        fast.append(fast_frames(prepared.tracked.tracks))
+        fast.append(fast_frames(prepared.tracked.video.ends))
         prepared = _correct_rolling_shutter(prepared, options, context)
         if scratch is not None:
             kept = KeptPictures(scratch / f"{number}.raw")

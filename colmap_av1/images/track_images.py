@@ -100,6 +100,11 @@ def track_images(
         context=context,
     )
     video = replace(video, tracks=_as_displayed(video.tracks, source, display))
+    if video.sampled_ends is not None:
+        ends = _as_displayed(video.sampled_ends, source, display)
+        if masks is not None:
+            ends = masks.on_frames(ends, min_length=1)
+        video = replace(video, sampled_ends=ends)
     if masks is not None:
         video = replace(
             video,

@@ -125,7 +125,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
             options.camera,
             run.context,
         )
-        fast = fast_frames(tracks)
+        fast = fast_frames(tracked.ends)
         # Later stages need no other frames of a long video.
         tracks = tracks.keep_frames(chosen.frames) if is_long else tracks
         _check_chosen(run, chosen, tracks.num_frames)
@@ -234,7 +234,8 @@ def _spread_in(run: Run, tracked: TrackedVideo, candidates: NDArray[np.int32]) -
     candidates = candidates[candidates < tracks.num_frames]
     names = image_names(run.options.match.images.file_name, candidates.tolist())
     every = ChosenImages(names, candidates)
-    key = key_images_of_video(run, tracks, every, tracked.inter_share, fast_frames(tracks))
+    fast = fast_frames(tracked.ends)
+    key = key_images_of_video(run, tracks, every, tracked.inter_share, fast)
     most = min(run.options.max_images, len(candidates))
     return every.some(spread_images(tracks.subsample_frames(candidates), most, key))
 

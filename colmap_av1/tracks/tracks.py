@@ -381,7 +381,37 @@ def build_tracks(
         >>> print(tracks.lengths.min(), tracks.lengths.max())
         10 60
     """
+    return build_tracks_and_ends(motion, options, progress, frames=frames)[0]
+
+
+def build_tracks_and_ends(
+    motion: Iterable[FrameMotion],
+    options: TrackOptions,
+    progress: Progress,
+    *,
+    frames: NDArray[np.int32] | None,
+    ends_of: int = 0,
+) -> tuple[Tracks, Tracks]:
+    """Chain the motion of a video into point tracks, and sample their ends in all frames.
+
+    Args:
+        motion: see `build_tracks`, as the next three.
+        options: how to chain.
+        progress: called after each coded frame.
+        frames: int32 [n] display indices of the frames whose observations are kept; None: all.
+        ends_of: the ends of one in this many tracks are returned; 0: of none.
+
+    Returns:
+        The tracks, see `build_tracks`. The first and the last observation of some tracks in all
+        frames, including tracks that are not observed in two of the frames: one observation per
+        track if both are the same.
+
+    Raises:
+        VideoError: see `build_tracks`.
+        ValueError: see `build_tracks`.
+    """
     core_options = _core_options(options)
+    core_options.ends_of = ends_of
     if frames is not None:
         core_options.observed = frames.tolist()
     builder = _core.TrackBuilder(core_options)
@@ -392,12 +422,14 @@ def build_tracks(
             )
         builder.add(frame)
         progress("tracks", count, None)
-    num_frames, width, height, offsets, frame_index, xy, sigma = builder.finish()
+    tracks, ends = (
+        Tracks(*arrays, confirmed=np.zeros(len(arrays[4]), dtype=np.bool_))
+        for arrays in builder.finish()
+    )
     give_back_free_memory()  # building needs as much memory again as the tracks
-    if num_frames == 0:
+    if tracks.num_frames == 0:
         raise VideoError("the video shows no frame: give a video with at least one picture")
-    confirmed = np.zeros(len(frame_index), dtype=np.bool_)
-    return Tracks(num_frames, width, height, offsets, frame_index, xy, sigma, confirmed)
+    return tracks, ends
 
 
 def least_length(options: TrackOptions) -> int:

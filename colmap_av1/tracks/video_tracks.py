@@ -30,7 +30,7 @@ from colmap_av1.options import (
 )
 from colmap_av1.tracks.overlays import remove_overlays
 from colmap_av1.tracks.refine import refine_spread_tracks, refine_tracks
-from colmap_av1.tracks.tracks import Tracks, build_tracks
+from colmap_av1.tracks.tracks import Tracks, build_tracks_and_ends
 from colmap_av1.util.files import remove_leftovers, scratch_folder
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.coded_size import coded_size, with_downscale
@@ -45,6 +45,10 @@ _Image = NDArray[np.uint8]
 
 # Overlay tracks are reported if they are at least this share of all tracks.
 _NOTABLE_SHARE = 0.01
+# If observations are kept in some frames only, the ends are kept of so many tracks that a frame has
+# about this many of them.
+_ENDS_PER_FRAME = 2000
+_PIXELS_PER_TRACK = 16
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,8 @@ class TrackedVideo:
         warnings: messages for the user, for example about damage of the stream.
         read_out: time in milliseconds in which the shutter reads the rows of a picture, if the
             tracks are corrected for it; None if they are not.
+        sampled_ends: if `tracks` are observed in some frames only, the first and the last
+            observation in any frame of a sample of all tracks.
     """
 
     tracks: Tracks
@@ -97,6 +103,12 @@ class TrackedVideo:
     inter_share: NDArray[np.float32]
     warnings: tuple[str, ...]
     read_out: float | None = None
+    sampled_ends: Tracks | None = None
+
+    @property
+    def ends(self) -> Tracks:
+        """Tracks, or a sample of them, that begin and end in the frames in which they do so."""
+        return self.tracks if self.sampled_ends is None else self.sampled_ends
 
 
 @contextmanager
@@ -243,18 +255,20 @@ def track_video(
             coded = None
             if stored is not None:
                 coded = np.unique(first[stored[stored < len(first)]])
-            tracks = build_tracks(motion, options.tracks, count, frames=coded)
+            width, height = source.stream.picture_size
+            of = max(1, width * height // (_PIXELS_PER_TRACK * _ENDS_PER_FRAME))
+            tracks, ends = build_tracks_and_ends(
+                motion, options.tracks, count, frames=coded, ends_of=0 if coded is None else of
+            )
             first = first[: count_with_repeats(first, tracks.num_frames)]
-            tracks = tracks.with_repeats(first)
+            tracks, ends = tracks.with_repeats(first), ends.with_repeats(first)
             if stored is not None:  # the first showing of a frame may not be among the frames
                 tracks = tracks.keep_frames(stored[stored < tracks.num_frames])
             num_frames, num_tracks = tracks.num_frames, tracks.num_tracks
-            tracks = remove_overlays(tracks)
+            tracks, ends = remove_overlays(tracks), remove_overlays(ends)
             overlay_share = (num_tracks - tracks.num_tracks) / max(num_tracks, 1)
-            tracks = tracks.as_displayed(source.stream.display, presented)
-            num_pixels = num_frames * tracks.width * tracks.height
-            if source.stream is not source.pictures:
-                tracks = tracks.scale_to(source.pictures.picture_size)
+            num_pixels = num_frames * width * height
+            tracks, ends = _as_shown(tracks, source), _as_shown(ends, source)
         if options.refine.refine != "none":
             with clock.measure("refinement"):
                 pictures = clock.iterate(
@@ -272,7 +286,21 @@ def track_video(
     bits_per_pixel = 8 * source.stream.path.stat().st_size / num_pixels
     notes += _notes(source, overlay_share, structure.reasons(bits_per_pixel))
     inter_share = _inter_share(structure, first, presented)
-    return TrackedVideo(tracks, structure.num_coded, inter_share, tuple(notes))
+    return TrackedVideo(
+        tracks,
+        structure.num_coded,
+        inter_share,
+        tuple(notes),
+        sampled_ends=None if frames is None else ends,
+    )
+
+
+def _as_shown(tracks: Tracks, source: VideoSource) -> Tracks:
+    """Convert tracks in the stream's pictures to tracks in pixels of the shown pictures."""
+    shown = tracks.as_displayed(source.stream.display, source.pictures.presented)
+    if source.stream is source.pictures:
+        return shown
+    return shown.scale_to(source.pictures.picture_size)
 
 
 def _notes(source: VideoSource, overlay_share: float, reasons: Sequence[str]) -> list[str]:

@@ -19,7 +19,8 @@ from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import BLOCK, FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import TrackOptions
-from colmap_av1.tracks.tracks import Tracks, build_tracks
+from colmap_av1.tracks.tracks import Tracks, build_tracks, build_tracks_and_ends
+from colmap_av1.util.progress import no_progress
 
 BLOCK_4X4, BLOCK_8X8, BLOCK_16X16, BLOCK_32X32, BLOCK_64X64 = 0, 3, 6, 9, 12
 NEWMV, GLOBALMV = 16, 15
@@ -953,6 +954,28 @@ def test_observations_in_selected_frames_are_a_subset(
     assert some.num_frames == tracks.num_frames
     for name in ("offsets", "frame", "xy", "sigma", "confirmed"):
         assert getattr(some, name).tobytes() == getattr(seen, name).tobytes()
+
+
+@given(motion=random_video(), options=any_options, of=st.integers(1, 3))
+@settings(max_examples=100, deadline=None)
+def test_ends_are_those_in_all_frames(
+    motion: list[FrameMotion], options: TrackOptions, of: int
+) -> None:
+    if all(f.display_index < 0 for f in motion):
+        return
+    tracks = build_tracks(motion, options)
+    one = np.array([0], np.int32)
+    _, ends = build_tracks_and_ends(motion, options, no_progress, frames=one, ends_of=of)
+    assert ends.num_frames == tracks.num_frames
+
+    def first_and_last(tracks: Tracks) -> set[tuple[float, ...]]:
+        first, last = tracks.offsets[:-1], tracks.offsets[1:] - 1
+        xy, frame = tracks.xy, tracks.frame
+        both = np.column_stack([frame[first], xy[first], frame[last], xy[last]])
+        return set(map(tuple, both.tolist()))
+
+    assert first_and_last(ends) <= first_and_last(tracks)
+    assert of > 1 or ends.num_tracks == tracks.num_tracks
 
 
 def test_kept_frames_are_renumbered() -> None:

@@ -32,17 +32,22 @@ void add_frame(TrackBuilder& builder, nb::handle frame) {
   builder.add(*motion);
 }
 
-nb::tuple finish(TrackBuilder& builder) {
-  TrackArrays arrays;
-  {
-    const nb::gil_scoped_release release;
-    arrays = builder.finish();
-  }
+nb::tuple adopt_tracks(TrackArrays&& arrays) {
   const std::size_t observations = arrays.frame.size();
   return nb::make_tuple(arrays.num_frames, arrays.width, arrays.height,
                         adopt(std::move(arrays.offsets)), adopt(std::move(arrays.frame)),
                         adopt<float>(std::move(arrays.xy), {observations, 2}),
                         adopt(std::move(arrays.sigma)));
+}
+
+nb::tuple finish(TrackBuilder& builder) {
+  TrackBuilder::Result result;
+  {
+    const nb::gil_scoped_release release;
+    result = builder.finish();
+  }
+  return nb::make_tuple(adopt_tracks(std::move(result.tracks)),
+                        adopt_tracks(std::move(result.ends)));
 }
 
 nb::object select_spread(int num_frames, const InputArray<std::int64_t, nb::ndim<1>>& offsets,
@@ -80,7 +85,8 @@ void bind_options(nb::module_& m) {
       .def_rw("bridge", &TrackBuilderOptions::bridge)
       .def_rw("cells", &TrackBuilderOptions::cells)
       .def_rw("seeding", &TrackBuilderOptions::seeding)
-      .def_rw("observed", &TrackBuilderOptions::observed);
+      .def_rw("observed", &TrackBuilderOptions::observed)
+      .def_rw("ends_of", &TrackBuilderOptions::ends_of);
 }
 
 }  // namespace
@@ -91,7 +97,8 @@ void bind_tracks(nb::module_& m) {
       .def(nb::init<const TrackBuilderOptions&>(), "options"_a)
       .def("add", &add_frame, "frame"_a, "Adds one coded frame, in bitstream order.")
       .def("finish", &finish,
-           "Ends all tracks: (num_frames, width, height, offsets, frame, xy, sigma).");
+           "Ends all tracks: the kept tracks, and the ends of some tracks, each as (num_frames, "
+           "width, height, offsets, frame, xy, sigma).");
 
   m.def("select_spread", &select_spread, nb::kw_only(), "num_frames"_a, "offsets"_a, "frame"_a,
         "xy"_a, "order"_a, "spacing"_a, "max_tracks_per_image"_a, "min_length"_a,

@@ -68,6 +68,7 @@ TrackBuilderOptions read_options(Input& input) {
   if ((choice & 1) != 0) options.bridge = 2;
   options.cells = 1 << (((choice >> 3) & 1) + ((choice >> 5) & 1));
   if ((choice & 64) != 0) options.seeding = (choice & 128) != 0 ? 2 * options.cells : options.cells;
+  options.ends_of = 1;
   return options;
 }
 
@@ -104,6 +105,19 @@ void check_tracks(const TrackArrays& tracks, const TrackBuilderOptions& options)
                 y <= static_cast<float>(tracks.height),
             "observations lie in the picture");
     }
+  }
+}
+
+// `ends` of all tracks, which are observed in all frames
+void check_ends(const TrackArrays& ends, const TrackArrays& tracks) {
+  check(ends.offsets.size() == tracks.offsets.size(), "every track has ends");
+  for (std::size_t t = 0; t + 1 < tracks.offsets.size(); ++t) {
+    const auto frame_at = [](const TrackArrays& arrays, std::int64_t observation) {
+      return arrays.frame[static_cast<std::size_t>(observation)];
+    };
+    check(frame_at(ends, ends.offsets[t]) == frame_at(tracks, tracks.offsets[t]) &&
+              frame_at(ends, ends.offsets[t + 1] - 1) == frame_at(tracks, tracks.offsets[t + 1] - 1),
+          "the ends are those of the track");
   }
 }
 
@@ -274,6 +288,8 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
   } else {
     run_parsed(input, builder);
   }
-  check_tracks(builder.finish(), options);
+  const TrackBuilder::Result result = builder.finish();
+  check_tracks(result.tracks, options);
+  check_ends(result.ends, result.tracks);
   return 0;
 }

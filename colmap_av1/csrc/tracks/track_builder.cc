@@ -12,7 +12,7 @@ TrackBuilder::TrackBuilder(const TrackBuilderOptions& options)
     : options_(options),
       grid_(options.cells),
       chainer_(options, grid_),
-      store_(options.min_length, options.observed) {
+      store_(options) {
   const auto is_part = [](int count) { return count == 1 || count == 2 || count == 4; };
   const int size = options.seeding;
   if (!is_part(options.cells) || !(is_part(size) || size == 2 * options.cells) ||
@@ -39,15 +39,15 @@ void TrackBuilder::add(const FrameMotion& coded) {
   release_frames(coded.slot_decode_index);
 }
 
-TrackArrays TrackBuilder::finish() {
+TrackBuilder::Result TrackBuilder::finish() {
   chain_up_to(std::numeric_limits<int>::max());
   for (const auto& frame : frames_) store_.release(*frame);
   frames_.clear();
   idle_frames_.clear();
-  TrackArrays tracks = store_.finish();
-  tracks.num_frames = num_frames_;
+  Result result{store_.finish(), store_.finish_ends()};
+  result.tracks.num_frames = result.ends.num_frames = num_frames_;
   *this = TrackBuilder(options_);
-  return tracks;
+  return result;
 }
 
 void TrackBuilder::check_order(const FrameMotion& coded) const {

@@ -32,8 +32,13 @@ class TrackBuilder {
   // Throws std::invalid_argument for inconsistent block data or a wrong order of frames.
   void add(const FrameMotion& frame);
 
-  // The kept tracks in the order of their seeds. The builder is empty afterwards.
-  TrackArrays finish();
+  struct Result {
+    TrackArrays tracks;
+    TrackArrays ends;
+  };
+  // The kept tracks, and the ends of some tracks, in the order of their seeds. The builder is empty
+  // afterwards.
+  Result finish();
 
  private:
   void check_order(const FrameMotion& frame) const;

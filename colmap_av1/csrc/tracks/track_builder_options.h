@@ -27,6 +27,9 @@ struct TrackBuilderOptions {
   int seeding = 1;
   // Display indices of the frames whose observations are kept; without a value, all frames.
   std::optional<std::vector<std::int32_t>> observed;
+  // Of one in this many tracks, the first and the last observation in any shown frame are kept as
+  // well, whichever frames are observed; 0: of none.
+  int ends_of = 0;
 
   bool is_within_reach(int interval) const {
     return !max_interval || std::abs(interval) <= *max_interval;

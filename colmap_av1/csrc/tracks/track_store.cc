@@ -8,8 +8,8 @@
 
 namespace colmap_av1::tracks {
 
-TrackStore::TrackStore(int min_length, std::optional<std::vector<std::int32_t>> observed)
-    : min_length_(min_length), observed_(std::move(observed)) {
+TrackStore::TrackStore(const TrackBuilderOptions& options)
+    : min_length_(options.min_length), observed_(options.observed), ends_of_(options.ends_of) {
   if (observed_) std::sort(observed_->begin(), observed_->end());
 }
 
@@ -29,6 +29,7 @@ std::int32_t TrackStore::start(ChainedFrame& frame, std::size_t cell) {
     tracks_.emplace_back();
     last_seen_.emplace_back();
     serials_.emplace_back();
+    if (ends_of_ > 0) ends_.emplace_back();
   } else {
     index = free_tracks_.back();
     free_tracks_.pop_back();
@@ -39,32 +40,43 @@ std::int32_t TrackStore::start(ChainedFrame& frame, std::size_t cell) {
   Track& track = tracks_[index];
   track.frames = 1;
   frame.cells[cell].track = index;
-  if (frame.is_shown()) {
-    ++track.length;
-    if (is_observed(frame)) record(track, frame, frame.cells[cell]);
-  }
+  if (frame.is_shown()) count(index, frame, frame.cells[cell], is_observed(frame));
   return index;
 }
 
 void TrackStore::observe(const ChainedFrame& frame) {
   const bool is_kept = is_observed(frame);
   for (const Cell& cell : frame.cells) {
-    if (cell.track < 0) continue;
-    Track& track = tracks_[cell.track];
-    ++track.length;
-    if (is_kept) record(track, frame, cell);
+    if (cell.track >= 0) count(cell.track, frame, cell, is_kept);
   }
 }
 
-void TrackStore::record(Track& track, const ChainedFrame& frame, const Cell& cell) {
+void TrackStore::count(std::int32_t index, const ChainedFrame& frame, const Cell& cell,
+                       bool is_observed) {
+  Track& track = tracks_[index];
+  ++track.length;
+  const bool is_end = has_ends(index);
+  if (!is_observed && !is_end) return;
+  const Observation seen = observation(frame, cell);
+  if (is_observed) record(track, seen);
+  if (!is_end) return;
+  if (track.length == 1) ends_[index].first = seen;
+  ends_[index].last = seen;
+}
+
+TrackStore::Observation TrackStore::observation(const ChainedFrame& frame,
+                                                const Cell& cell) const {
   const float scale_x = static_cast<float>(width_) / frame.motion.width;
   const float scale_y = static_cast<float>(height_) / frame.motion.height;
+  return {frame.motion.display_index,
+          {cell.position.x * scale_x, cell.position.y * scale_y},
+          std::sqrt(cell.variance) * scale_y};
+}
+
+void TrackStore::record(Track& track, const Observation& observation) {
   const int place = track.observed % kStretch;
   if (place == 0) start_stretch(track);
-  stretches_[track.last_stretch].observations[place] = {
-      frame.motion.display_index,
-      {cell.position.x * scale_x, cell.position.y * scale_y},
-      std::sqrt(cell.variance) * scale_y};
+  stretches_[track.last_stretch].observations[place] = observation;
   ++track.observed;
 }
 
@@ -92,7 +104,13 @@ void TrackStore::release(ChainedFrame& frame) {
     Track& track = tracks_[cell.track];
     if (--track.frames > 0) continue;
     free_tracks_.push_back(cell.track);
-    if (track.length >= min_length_ && track.observed >= least_observed) keep(cell.track);
+    if (track.length >= min_length_) {
+      if (track.observed >= least_observed) keep(cell.track);
+      if (has_ends(cell.track)) {
+        ends_[cell.track].serial = serials_[cell.track];
+        kept_ends_.push_back(ends_[cell.track]);
+      }
+    }
     for (std::int32_t s = track.last_stretch; s >= 0; s = previous_stretch_[s]) {
       free_stretches_.push_back(s);
     }
@@ -146,6 +164,25 @@ TrackArrays TrackStore::finish() {
   out.xy = take_sorted(done_.xy, 2);
   out.frame = take_sorted(done_.frame, 1);
   out.sigma = take_sorted(done_.sigma, 1);
+  return out;
+}
+
+TrackArrays TrackStore::finish_ends() {
+  std::ranges::sort(kept_ends_, {}, &Ends::serial);
+  TrackArrays out;
+  out.width = width_;
+  out.height = height_;
+  out.offsets.push_back(0);
+  const auto add = [&out](const Observation& observation) {
+    out.frame.push_back(observation.frame);
+    out.xy.insert(out.xy.end(), {observation.position.x, observation.position.y});
+    out.sigma.push_back(observation.sigma);
+  };
+  for (const Ends& ends : kept_ends_) {
+    add(ends.first);
+    if (ends.last.frame != ends.first.frame) add(ends.last);
+    out.offsets.push_back(static_cast<std::int64_t>(out.frame.size()));
+  }
   return out;
 }
 

@@ -10,6 +10,7 @@
 
 #include "tracks/chained_frame.h"
 #include "tracks/geometry.h"
+#include "tracks/track_builder_options.h"
 
 namespace colmap_av1::tracks {
 
@@ -26,9 +27,8 @@ struct TrackArrays {
 // Holds the observations, in the observed frames, of tracks that are alive or long enough.
 class TrackStore {
  public:
-  // `observed`: display indices of the observed frames; without a value, all frames. With a value,
-  // a track that is observed in only one of these frames is not kept.
-  TrackStore(int min_length, std::optional<std::vector<std::int32_t>> observed);
+  // With `observed` frames, a track that is observed in only one of them is not kept.
+  explicit TrackStore(const TrackBuilderOptions& options);
 
   // Size of the pictures in whose pixels positions are given.
   void set_size(int width, int height);
@@ -56,9 +56,11 @@ class TrackStore {
   // Releases a frame. A track that no frame holds any more ends.
   void release(ChainedFrame& frame);
 
-  // Returns the kept tracks in the order of their seeds. No frame may hold a track any more, and
-  // the store cannot be used afterwards.
+  // Returns the kept tracks in the order of their seeds. No frame may hold a track any more.
   TrackArrays finish();
+  // The ends of some of the long enough tracks, in the same order: one observation if they are the
+  // same, else two. The store cannot be used afterwards.
+  TrackArrays finish_ends();
 
  private:
   // Kept small, because tracks are accessed often and in random order.
@@ -90,24 +92,42 @@ class TrackStore {
     std::int32_t length = 0;
   };
 
-  void record(Track& track, const ChainedFrame& frame, const Cell& cell);
+  struct Ends {
+    std::int64_t serial = 0;
+    Observation first;
+    Observation last;
+  };
+
+  // Counts an observation of a track in a shown frame, and keeps it if the frame `is_observed`.
+  void count(std::int32_t index, const ChainedFrame& frame, const Cell& cell, bool is_observed);
+  void record(Track& track, const Observation& observation);
+  Observation observation(const ChainedFrame& frame, const Cell& cell) const;
   bool is_observed(const ChainedFrame& frame) const;
+  bool has_ends(std::int32_t index) const {
+    if (ends_of_ == 0) return false;
+    // Fibonacci hashing. The serial numbers themselves are those of a regular grid of seeds.
+    const auto hash = static_cast<std::uint64_t>(serials_[index]) * 0x9E3779B97F4A7C15U >> 32U;
+    return hash % static_cast<std::uint64_t>(ends_of_) == 0;
+  }
   void start_stretch(Track& track);
   void keep(std::int32_t index);
 
   int min_length_;
   std::optional<std::vector<std::int32_t>> observed_;  // ascending
+  int ends_of_;
   int width_ = 0;
   int height_ = 0;
   std::vector<Track> tracks_;
   std::vector<std::int32_t> last_seen_;  // order of the last frame that continued each track
   std::vector<std::int64_t> serials_;    // serial numbers of the tracks' seeds
+  std::vector<Ends> ends_;               // of the tracks that have ends
   std::vector<std::int32_t> free_tracks_;
   std::deque<Stretch> stretches_;
   std::vector<std::int32_t> previous_stretch_;  // by stretch, the previous one of the same track
   std::vector<std::int32_t> free_stretches_;
   std::vector<Kept> kept_;  // in the order in which they ended, like their observations
   Done done_;
+  std::vector<Ends> kept_ends_;
 };
 
 }  // namespace colmap_av1::tracks
