@@ -32,12 +32,11 @@ from colmap_av1.geometry.track_points import (
     triangulate_tracks,
 )
 from colmap_av1.geometry.triangulation import TriangulatedPoints
-from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import ImageSet, Pictures, ShownVideo, pictures_of
 from colmap_av1.images.inputs import Inputs, paths_of, read_inputs
 from colmap_av1.images.of_videos import VideoImages, images_of_videos
 from colmap_av1.images.photos import Photo
-from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
+from colmap_av1.images.track_images import ImageChoice, TrackedImages, track_chosen_images
 from colmap_av1.options import DensifyOptions
 from colmap_av1.splats.gaussians import (
     check_gaussians_path,
@@ -46,7 +45,7 @@ from colmap_av1.splats.gaussians import (
 )
 from colmap_av1.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.tracks.video_tracks import TrackedVideo, open_source
+from colmap_av1.tracks.video_tracks import open_source
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import check_new_folder, scratch_folder, whole_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -227,18 +226,6 @@ def _track(
         The tracks, only in the frames that are images, and a description of the conversion.
     """
     matching = options.match
-
-    def choose(tracked: TrackedVideo) -> ChosenImages:
-        return choose_from_video(
-            source,
-            tracked.tracks,
-            matching.images,
-            matching.reading,
-            existing=images.names,
-            folder=images.folder,
-            context=context,
-        )
-
     with (
         open_source(images.video, matching.source, next_to=output, context=context) as source,
         unchanged(source.stream.state),
@@ -246,11 +233,12 @@ def _track(
         chaining = chaining_for_points(
             matching.tracks, options.triangulate, is_downscaled=source.is_downscaled
         )
-        found = track_images(
+        found = track_chosen_images(
             source,
             replace(matching.tracking, tracks=chaining),
-            choose,
+            ImageChoice(matching.images, images.names, images.folder),
             masks=images.masks,
+            every_frame=False,
             context=context,
         )
     tracks = found.tracks.keep_frames(found.chosen.frames).scale_to(images.size)

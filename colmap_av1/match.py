@@ -29,6 +29,7 @@ from colmap_av1.images.photos import check_places, place_photos
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_prepared
 from colmap_av1.images.recognising import check_content, frames_near
+from colmap_av1.images.track_images import MIN_IMAGES
 from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
 from colmap_av1.matching.few_matches import matching_warning
 from colmap_av1.matching.gaps import fast_frames
@@ -558,8 +559,13 @@ def _match_jointly(
     """Match the images by the observations that agree with an estimate of all poses."""
     stages = scratch / ".stages"
     stages.mkdir()
-    # The images are already chosen, and their names need not suit trainers.
-    chosen = replace(options, images=ImageOptions())
+    # The images are already chosen, and their names need not suit trainers. Tracks are long enough
+    # in all frames, of which only the images may be left.
+    tracks = replace(options.tracks, min_length=MIN_IMAGES)
+    is_limited = any(own.tracked.video.sampled_ends is not None for own in images.videos)
+    chosen = replace(
+        options, images=ImageOptions(), tracks=tracks if is_limited else options.tracks
+    )
     run = Run(
         images.inputs,
         tuple(own.source for own in images.videos),

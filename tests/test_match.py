@@ -99,7 +99,7 @@ def test_report_agrees_with_a_new_database(clip: Path, tmp_path: Path) -> None:
     assert report.track_lengths[0.0] >= 3
     assert report.track_lengths[1.0] <= 16
     assert list(report.seconds) == [
-        "motion", "tracks", "choice", "pairs", "focal length", "verification", "images", "database"
+        "choice", "motion", "tracks", "pairs", "focal length", "verification", "images", "database"
     ]  # fmt: skip
     assert report.warnings == ()
 
@@ -293,6 +293,13 @@ def test_truncated_stream_is_used_up_to_the_damage(
     refined = match(tmp_path / "b.db", cut, options=LK)
     assert refined.num_frames == report.num_frames
     assert refined.num_observations == report.num_observations
+    # A few images are spread over the frames before the damage.
+    few = MatchOptions(images=ImageOptions(num_images=4), verify=PAIRS)
+    spread = match(tmp_path / "c.db", cut, options=few)
+    names = [image.name for image in read_images(tmp_path / "c.db")]
+    assert spread.num_images == 4
+    assert names[-1] == f"frame_{report.num_frames - 1:06d}.png"
+    assert spread.num_inliers > 0
 
 
 def test_database_is_written_although_the_mapper_crashes(
@@ -438,7 +445,7 @@ def test_refined_tracks_can_be_limited_per_image(clip: Path, tmp_path: Path) -> 
     plain = match(tmp_path / "a.db", clip)
     options = replace(LK, density=DensityOptions(max_tracks_per_image=100))
     report = match(tmp_path / "b.db", clip, options=options)
-    assert list(report.seconds)[:4] == ["motion", "tracks", "decoding", "refinement"]
+    assert {"decoding", "refinement"} < set(report.seconds)
     counts = [row[1] for row in tables(tmp_path / "b.db")["keypoints"]]
     assert max(counts) == 100
     assert report.num_tracks < plain.num_tracks / 2

@@ -39,9 +39,6 @@ _Decode = Callable[[Collection[int] | None], Iterable[tuple[int, _Image]]]
 _SHARPNESS_SIZE = 640
 # A frame is blurred if its sharpness is less than this share of the sharpest frame nearby.
 _BLURRED = 0.7
-# A frame may replace a blurred one if it has at least this share of the tracks that the blurred one
-# has in common with the neighbouring images.
-_AS_GOOD = 0.9
 # Largest distance by which an image may move, as a share of the distance to the next one.
 _REACH = 0.25
 # Focal length assumed for fitting the camera's rotation, in units of the longer side. The remaining
@@ -78,13 +75,14 @@ class ChosenImages:
 
 
 def choose_images(
-    tracks: Tracks,
+    num_frames: int,
     options: ImageOptions,
     *,
     existing: Sequence[str],
     folder: Path | None,
     times: Callable[[], NDArray[np.float64] | None],
     decode: _Decode,
+    tracks: Tracks | None = None,
 ) -> ChosenImages:
     """Choose the frames that become images: the frames of existing images, else by the options.
 
@@ -94,13 +92,14 @@ def choose_images(
     found by content.
 
     Args:
-        tracks: tracks through all frames.
+        num_frames: number of frames of the video.
         options: how to choose.
         existing: names of existing images, in any order.
         folder: folder of the images; None: no picture is decoded.
         times: returns the times of the frames in seconds; None if unknown.
         decode: yields (display index, picture) of some frames, given by their indices, or with
             None of all frames.
+        tracks: tracks through all frames if new images are spread in parallax; else None.
 
     Raises:
         ImageError: the frames of the existing images cannot be determined, or fewer than two are
@@ -108,35 +107,38 @@ def choose_images(
         OptionError: an option does not apply to existing images, or `fps` needs times.
     """
     if existing:
-        chosen = _find_existing(tracks.num_frames, options, existing, folder, decode)
+        chosen = _find_existing(num_frames, options, existing, folder, decode)
     elif options.frame_list is not None:
-        chosen = read_frame_list(options.frame_list, tracks.num_frames, options)
+        chosen = read_frame_list(options.frame_list, num_frames, options)
         for name in chosen.names:
             check_new_name(name)
     else:
-        at = times() if options.fps or options.num_images else None
-        frames = choose_frames(tracks, options, at)
+        if tracks is not None and options.num_images is not None:
+            frames = spread_in_parallax(tracks, options.num_images)
+        else:
+            at = times() if options.fps or options.num_images else None
+            frames = choose_frames(num_frames, options, at)
         if folder is not None and options.skip_blurred and (options.fps or options.num_images):
-            frames = skip_blurred(frames, tracks, lambda asked: _sharpness(decode(set(asked))))
+            frames = skip_blurred(frames, lambda asked: _sharpness(decode(set(asked))))
         chosen = ChosenImages(image_names(options.file_name, frames.tolist()), frames)
     if len(chosen.frames) < 2:
         raise ImageError(
-            f"{len(chosen.frames)} of {tracks.num_frames} frames become images: matches need two "
-            f"or more: {'give a longer video' if tracks.num_frames < 2 else 'choose more frames'}"
+            f"{len(chosen.frames)} of {num_frames} frames become images: matches need two or more: "
+            f"{'give a longer video' if num_frames < 2 else 'choose more frames'}"
         )
     return chosen
 
 
 def choose_frames(
-    tracks: Tracks,
+    num_frames: int,
     options: ImageOptions,
     times: NDArray[np.float64] | None = None,
 ) -> NDArray[np.int32]:
     """Choose the frames that become images: all, unless the options say otherwise.
 
     Args:
-        tracks: tracks through all frames.
-        options: how to choose; not by `frame_list`, see `read_frame_list`.
+        num_frames: number of frames of the video.
+        options: how to choose; not by `frame_list` or in parallax.
         times: float64 [num_frames] time of each frame in seconds, ascending; None: frames are
             equally spaced.
 
@@ -146,28 +148,29 @@ def choose_frames(
     Raises:
         OptionError: `fps` needs times.
     """
-    count = tracks.num_frames
     if options.every is not None:
-        return np.arange(0, count, options.every, dtype=np.int32)
+        return np.arange(0, num_frames, options.every, dtype=np.int32)
     if options.fps is not None:
         if times is None:
             raise OptionError("the video has no time stamps: give every instead of fps")
         return _at_rate(times - times[0], options.fps)
     if options.num_images is None:
-        return np.arange(count, dtype=np.int32)
-    if options.num_images > count:
-        warnings.warn(
-            f"the video has {count} frames, {options.num_images} images are wanted: all of its "
-            "frames become images",
-            stacklevel=2,
-        )
-        return np.arange(count, dtype=np.int32)
-    if options.select == "parallax":
-        place = np.concatenate([[0.0], np.cumsum(parallax(tracks))])
-    else:
-        place = times if times is not None else np.arange(count, dtype=np.float64)
-    wanted = np.linspace(place[0], place[-1], options.num_images)
-    return _distinct(_nearest(place, wanted), count)
+        return np.arange(num_frames, dtype=np.int32)
+    place = times if times is not None else np.arange(num_frames, dtype=np.float64)
+    return _evenly_spread(place, options.num_images)
+
+
+def spread_in_parallax(tracks: Tracks, num_images: int) -> NDArray[np.int32]:
+    """Choose frames that are spread evenly in `parallax`.
+
+    Args:
+        tracks: tracks through all frames.
+        num_images: number of frames to choose.
+
+    Returns:
+        int32 display indices, strictly ascending.
+    """
+    return _evenly_spread(np.concatenate([[0.0], np.cumsum(parallax(tracks))]), num_images)
 
 
 def parallax(tracks: Tracks) -> NDArray[np.float64]:
@@ -205,17 +208,15 @@ def parallax(tracks: Tracks) -> NDArray[np.float64]:
 
 def skip_blurred(
     frames: NDArray[np.int32],
-    tracks: Tracks,
     sharpness: Callable[[Sequence[int]], NDArray[np.float64]],
 ) -> NDArray[np.int32]:
     """Replace blurred frames by sharp ones nearby.
 
-    An image moves by at most a quarter of the distance to its neighbours, to the sharpest frame
-    that has nearly as many tracks in common with them. The first and the last image stay.
+    An image moves by at most a quarter of the distance to its neighbours, to the sharpest frame.
+    The first and the last image stay.
 
     Args:
         frames: chosen frames, ascending.
-        tracks: tracks through all frames.
         sharpness: returns the sharpness of frames; called once, with ascending frames.
 
     Returns:
@@ -231,16 +232,11 @@ def skip_blurred(
         return frames
     asked = np.unique(np.concatenate(list(windows.values())))
     measured = dict(zip(asked.tolist(), sharpness(asked.tolist()), strict=True))
-    seen = _tracks_by_frame(tracks)
     chosen = frames.copy()
     for k, window in windows.items():
         sharp = np.array([measured[int(f)] for f in window])
-        if measured[int(frames[k])] >= _BLURRED * sharp.max():
-            continue
-        beside = (seen(chosen[k - 1]), seen(frames[k + 1]))
-        shared = np.array([sum(_num_common(seen(f), b) for b in beside) for f in window])
-        as_good = shared >= _AS_GOOD * shared[np.searchsorted(window, frames[k])]
-        chosen[k] = window[np.argmax(np.where(as_good, sharp, -np.inf))]
+        if measured[int(frames[k])] < _BLURRED * sharp.max():
+            chosen[k] = window[sharp.argmax()]
     return np.asarray(chosen, dtype=np.int32)
 
 
@@ -439,6 +435,20 @@ def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:
     return np.flatnonzero(is_last & (tick < num_ticks)).astype(np.int32)
 
 
+def _evenly_spread(places: NDArray[np.float64], num_images: int) -> NDArray[np.int32]:
+    """Choose frames evenly by the positions of all frames, which ascend."""
+    count = len(places)
+    if num_images > count:
+        warnings.warn(
+            f"the video has {count} frames, {num_images} images are wanted: all of its frames "
+            "become images",
+            stacklevel=2,
+        )
+        return np.arange(count, dtype=np.int32)
+    wanted = np.linspace(places[0], places[-1], num_images)
+    return _distinct(_nearest(places, wanted), count)
+
+
 def _nearest(places: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
     """Index of the position nearest to each wanted one, the earlier of two; positions ascend."""
     above = np.clip(np.searchsorted(places, wanted), 1, max(len(places) - 1, 1))
@@ -474,14 +484,3 @@ def _rotation_field(
         # Weights for least absolute residuals, which are robust to other motion.
         weight = 1 / np.maximum(np.hypot(*(motion - field).T), 1e-3)
     return np.asarray(field)
-
-
-def _tracks_by_frame(tracks: Tracks) -> Callable[[int], NDArray[np.int64]]:
-    """A function that returns the tracks observed in a frame, ascending."""
-    number = tracks.track
-    order, bounds = tracks.by_frame()
-    return lambda frame: number[order[bounds[frame] : bounds[frame + 1]]]
-
-
-def _num_common(a: NDArray[np.int64], b: NDArray[np.int64]) -> int:
-    return len(np.intersect1d(a, b, assume_unique=True))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.images.choosing import choose_frames
-from colmap_av1.options import ImageOptions
+from colmap_av1.images.choosing import spread_in_parallax
 from colmap_av1.tracks.tracks import Tracks
 
 # Share of its cells with tracks that a key image has in common with the next one. Three consecutive
@@ -69,8 +68,7 @@ def spread_images(tracks: Tracks, num_images: int, key: NDArray[np.int64]) -> ND
     Returns:
         int32 frames, ascending: `num_images`, or more if key images are close together.
     """
-    evenly = ImageOptions(num_images=num_images, select="parallax")
-    spread = choose_frames(tracks, evenly).astype(np.int64)
+    spread = spread_in_parallax(tracks, num_images).astype(np.int64)
     # Each key image replaces the nearest other image.
     after = np.clip(np.searchsorted(spread, key), 1, len(spread) - 1)
     is_before = key - spread[after - 1] <= spread[after] - key

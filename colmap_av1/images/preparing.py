@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.images.choosing import ChosenImages, check_frame_list
+from colmap_av1.images.choosing import check_frame_list
 from colmap_av1.images.files import (
     blur_warning,
     check_image_folder,
@@ -25,17 +25,13 @@ from colmap_av1.images.masks import VideoMasks
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.recognising import check_content, frames_near, is_turned_back
 from colmap_av1.images.track_images import (
+    ImageChoice,
     TrackedImages,
-    choose_from_video,
     decode_pictures,
-    track_images,
+    track_chosen_images,
 )
 from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions, ReadOptions
-from colmap_av1.tracks.video_tracks import (
-    TrackedVideo,
-    VideoSource,
-    open_source,
-)
+from colmap_av1.tracks.video_tracks import VideoSource, open_source
 from colmap_av1.util.progress import Progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.decoding import decode_frames
@@ -148,29 +144,18 @@ def prepare_images(
         names = existing or names_of_all(options.images, count_shown(video))
         masks.check([size, fit.video_size], names, options.images)
 
-    def choose(tracked: TrackedVideo) -> ChosenImages:
-        return choose_from_video(
-            source,
-            tracked.tracks,
-            options.images,
-            options.reading,
-            existing=existing,
-            folder=folder,
-            display=display,
-            context=context,
-        )
-
     with (
         open_source(video, options.source, next_to=next_to, context=context) as source,
         unchanged(source.stream.state),
     ):
-        found = track_images(
+        found = track_chosen_images(
             source,
             options.tracking,
-            choose,
+            ImageChoice(options.images, existing, folder, display),
             masks=masks,
-            display=display,
             one_size=folder is not None,
+            # Correcting the rolling shutter needs the motion between all neighbouring frames.
+            every_frame=options.camera.rolling_shutter != "none",
             context=context,
         )
     if folder is not None:

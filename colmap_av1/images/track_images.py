@@ -17,6 +17,7 @@ from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import (
     TrackedVideo,
     VideoSource,
+    count_frames,
     decodable_frames,
     refine_in_images,
     times_of_frames,
@@ -28,7 +29,7 @@ from colmap_av1.video.display import Display, shown_size, turned_back
 _Image = NDArray[np.uint8]
 
 # Smallest number of observations of a track if only images are kept.
-_MIN_IMAGES = 2
+MIN_IMAGES = 2
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,103 @@ class TrackedImages:
     def with_tracks(self, tracks: Tracks) -> TrackedImages:
         """The same with other tracks."""
         return replace(self, video=replace(self.video, tracks=tracks))
+
+
+@dataclass(frozen=True)
+class ImageChoice:
+    """How the images of a video are chosen.
+
+    Attributes:
+        options: the options.
+        existing: names of existing images.
+        folder: folder of the images; None: no picture is decoded.
+        display: how images show the pictures; None: as players do.
+    """
+
+    options: ImageOptions
+    existing: Sequence[str] = ()
+    folder: Path | None = None
+    display: Display | None = None
+
+    @property
+    def needs_tracks(self) -> bool:
+        """Whether images are chosen from the tracks, and not before the motion is chained."""
+        return self.options.select == "parallax" and not self.existing
+
+
+def track_chosen_images(
+    source: VideoSource,
+    options: TrackingOptions,
+    choice: ImageChoice,
+    *,
+    masks: VideoMasks | None,
+    one_size: bool = True,
+    every_frame: bool,
+    context: RunContext,
+) -> TrackedImages:
+    """Choose the images of a video, and chain its motion into tracks.
+
+    Args:
+        source: the video.
+        options: how motion is read and chained, and tracks are refined.
+        choice: how images are chosen.
+        masks: masks of the video; None: all pixels are used.
+        one_size: raise an error if frames differ in size, see `track_video`.
+        every_frame: keep the observations in all frames. Otherwise, only those in the images are
+            kept if neither refinement nor the choice needs others, which takes less memory.
+        context: measures the stages of `track_video`, "choice" and "refinement".
+
+    Raises:
+        OptionError: see `track_images` and `choose_images`, as the following.
+        VideoError: see there.
+        BitstreamError: see there.
+        ImageError: see there.
+    """
+
+    def track(
+        choose: Callable[[TrackedVideo], ChosenImages], frames: NDArray[np.int32] | None = None
+    ) -> TrackedImages:
+        return track_images(
+            source,
+            options,
+            choose,
+            masks=masks,
+            display=choice.display,
+            one_size=one_size,
+            frames=frames,
+            context=context,
+        )
+
+    def choose(num_frames: int, tracks: Tracks | None = None) -> ChosenImages:
+        return choose_images(
+            num_frames,
+            choice.options,
+            existing=choice.existing,
+            folder=choice.folder,
+            times=lambda: times_of_frames(source, num_frames),
+            decode=lambda wanted: decode_pictures(
+                source, num_frames, options.read, choice.display, wanted=wanted, context=context
+            ),
+            tracks=tracks,
+        )
+
+    if choice.needs_tracks:
+        return track(lambda tracked: choose(tracked.tracks.num_frames, tracked.tracks))
+    num_frames = count_frames(source, options.read)
+    with context.clock.measure("choice"):
+        chosen = choose(num_frames)
+
+    def choose_again(tracked: TrackedVideo) -> ChosenImages:
+        """The images; chosen anew if damage, which headers do not show, leaves fewer frames."""
+        left = tracked.tracks.num_frames
+        return chosen if left >= num_frames else choose(left)
+
+    if every_frame or options.refine.refine != "none" or len(chosen.frames) == num_frames:
+        return track(choose_again)
+    found = track(choose_again, chosen.frames)
+    if np.isin(found.chosen.frames, chosen.frames).all():
+        return found
+    return track(lambda _: found.chosen, found.chosen.frames)
 
 
 def track_images(
@@ -91,7 +189,7 @@ def track_images(
             has no mask.
         OptionError: an option does not fit the video or its images.
     """
-    min_length = least_length(options.tracks) if frames is None else _MIN_IMAGES
+    min_length = least_length(options.tracks) if frames is None else MIN_IMAGES
     video = track_video(
         source,
         options,
@@ -128,46 +226,6 @@ def track_images(
     if masks is not None:
         video = replace(video, tracks=masks.on_tracks(video.tracks, chosen, min_length))
     return TrackedImages(video, chosen)
-
-
-def choose_from_video(
-    source: VideoSource,
-    tracks: Tracks,
-    options: ImageOptions,
-    read: ReadOptions,
-    *,
-    existing: Sequence[str] = (),
-    folder: Path | None,
-    display: Display | None = None,
-    context: RunContext,
-) -> ChosenImages:
-    """Choose the images of a video, see `choose_images`.
-
-    Args:
-        source: the video.
-        tracks: tracks through all its frames.
-        options: how images are chosen.
-        read: how pictures are decoded.
-        existing: names of existing images.
-        folder: folder of the images; None: no picture is decoded.
-        display: how images show the pictures; None: as players do.
-        context: its progress is called in the stage "recognising".
-    """
-    return choose_images(
-        tracks,
-        options,
-        existing=existing,
-        folder=folder,
-        times=lambda: times_of_frames(source, tracks.num_frames),
-        decode=lambda wanted: decode_pictures(
-            source,
-            tracks.num_frames,
-            read,
-            display,
-            wanted=wanted,
-            context=context,
-        ),
-    )
 
 
 def decode_pictures(

@@ -61,8 +61,8 @@ class ImageOptions(Options):
     )
     skip_blurred: bool = option(
         True,
-        "replace a blurred image by a nearby sharp frame with as much overlap; applies only if "
-        "num_images or fps chooses the frames and images are written",
+        "replace a blurred image by a nearby sharp frame; applies only if num_images or fps "
+        "chooses the frames and images are written",
     )
     first_number: int | None = option(
         None,

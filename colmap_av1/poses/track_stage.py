@@ -17,7 +17,12 @@ from colmap_av1.geometry.track_points import chaining_for_points
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.key_images import key_images, spread_images
 from colmap_av1.images.names import image_names
-from colmap_av1.images.track_images import TrackedImages, choose_from_video, track_images
+from colmap_av1.images.track_images import (
+    ImageChoice,
+    TrackedImages,
+    track_chosen_images,
+    track_images,
+)
 from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.links.plan import images_to_link
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter, shutter_settings
@@ -109,14 +114,21 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     )
     tracking = replace(options.tracking, tracks=chaining)
     name, shown = stage_of_video(run, video), source.pictures
-    count = 0 if options.images.ways else count_frames(source, options.read)
+    count = count_frames(source, options.read)
     is_long = count > run.options.max_images
 
     def make(partial: Path) -> TracksResult:
-        if is_long:
+        if is_long and not options.images.ways:
             found = _track_long(run, video, tracking, count)
         else:
-            found = _track_and_choose(run, video, tracking, partial)
+            found = track_chosen_images(
+                source,
+                tracking,
+                ImageChoice(options.images, folder=partial),
+                masks=run.inputs.masks_of_videos[video],
+                every_frame=not is_long or _has_shutter(run),
+                context=run.context,
+            )
         chosen, tracked = found.chosen, found.video
         tracks, read_out = correct_rolling_shutter(
             tracked.tracks,
@@ -167,26 +179,6 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     )
 
 
-def _track_and_choose(
-    run: Run, video: int, options: TrackingOptions, folder: Path
-) -> TrackedImages:
-    """Chain the motion of a video into tracks, and choose its images."""
-    source, images = run.sources[video], run.options.match.images
-
-    def choose(tracked: TrackedVideo) -> ChosenImages:
-        return choose_from_video(
-            source,
-            pose_tracks(run, tracked.tracks),
-            images,
-            options.read,
-            folder=folder,
-            context=run.context,
-        )
-
-    masks = run.inputs.masks_of_videos[video]
-    return track_images(source, options, choose, masks=masks, context=run.context)
-
-
 def _track_long(run: Run, video: int, options: TrackingOptions, count: int) -> TrackedImages:
     """Track a video with more frames than `max_images`, and keep the chosen images only.
 
@@ -198,8 +190,7 @@ def _track_long(run: Run, video: int, options: TrackingOptions, count: int) -> T
     candidates = np.array(evenly_spread(count, _CANDIDATES * run.options.max_images), np.int32)
     width, height = source.stream.picture_size
     held = len(candidates) * width * height / _PIXELS_PER_OBSERVATION
-    # Correcting the rolling shutter needs the motion between all neighbouring frames.
-    has_shutter = run.options.match.camera.rolling_shutter != "none"
+    has_shutter = _has_shutter(run)
     track = functools.partial(track_images, source, masks=run.inputs.masks_of_videos[video])
 
     if options.refine.refine == "none" and not has_shutter and held <= _MAX_HELD:
@@ -226,6 +217,11 @@ def _track_long(run: Run, video: int, options: TrackingOptions, count: int) -> T
         frames=None if has_shutter else chosen.frames,
         context=run.context,
     )
+
+
+def _has_shutter(run: Run) -> bool:
+    """Whether the rolling shutter is corrected, which needs the motion between all frames."""
+    return run.options.match.camera.rolling_shutter != "none"
 
 
 def _spread_in(run: Run, tracked: TrackedVideo, candidates: NDArray[np.int32]) -> ChosenImages:

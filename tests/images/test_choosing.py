@@ -22,6 +22,7 @@ from colmap_av1.images.choosing import (
     parallax,
     read_frame_list,
     skip_blurred,
+    spread_in_parallax,
 )
 from colmap_av1.match import MatchReport, match
 from colmap_av1.options import DensityOptions, ImageOptions, MatchOptions, VerifyOptions
@@ -77,10 +78,10 @@ def test_any_number_of_images_is_spread_evenly_in_time(
     options = ImageOptions(num_images=wanted)
     if wanted > num_frames:
         with pytest.warns(UserWarning, match="all of its frames"):
-            frames = choose_frames(still(num_frames), options, times)
+            frames = choose_frames(num_frames, options, times)
         assert frames.tolist() == list(range(num_frames))
         return
-    frames = choose_frames(still(num_frames), options, times)
+    frames = choose_frames(num_frames, options, times)
     assert len(frames) == wanted
     assert np.all(np.diff(frames) > 0)
     assert (frames[0], frames[-1]) == (0, num_frames - 1)
@@ -89,12 +90,12 @@ def test_any_number_of_images_is_spread_evenly_in_time(
 def test_spread_is_even_in_time_if_times_are_known() -> None:
     # The first second has 30 frames, the second one 10.
     times = np.concatenate([np.arange(30) / 30, 1 + np.arange(11) / 10])
-    frames = choose_frames(still(41), ImageOptions(num_images=5), times)
+    frames = choose_frames(41, ImageOptions(num_images=5), times)
     assert frames.tolist() == [0, 15, 30, 35, 40]
-    assert choose_frames(still(41), ImageOptions(num_images=5)).tolist() == [0, 10, 20, 30, 40]
-    assert choose_frames(still(41), ImageOptions(every=20), times).tolist() == [0, 20, 40]
+    assert choose_frames(41, ImageOptions(num_images=5)).tolist() == [0, 10, 20, 30, 40]
+    assert choose_frames(41, ImageOptions(every=20), times).tolist() == [0, 20, 40]
     for fps in (100, 2e9):
-        assert len(choose_frames(still(41), ImageOptions(fps=fps), times)) == 41
+        assert len(choose_frames(41, ImageOptions(fps=fps), times)) == 41
 
 
 @pytest.mark.parametrize("fps", [2, 5, 7, 20])
@@ -103,7 +104,7 @@ def test_fps_selects_the_same_frames_as_ffmpeg(
 ) -> None:
     clip = encode(make_frames(25, 96, 64), tmp_path / "clip.mp4")
     ffmpeg("-i", clip, "-vf", f"fps={fps}", tmp_path / "%04d.png")
-    frames = choose_frames(still(25), ImageOptions(fps=fps), frame_times(clip))
+    frames = choose_frames(25, ImageOptions(fps=fps), frame_times(clip))
     pictures = [picture for _, picture in decode_frames(clip)]
     cut = [cv2.imread(str(path)) for path in sorted(tmp_path.glob("*.png"))]
     shown = [int(np.argmin([np.abs(c.astype(int) - p).mean() for p in pictures])) for c in cut]
@@ -124,14 +125,12 @@ def test_parallax_is_nearly_independent_of_rotation() -> None:
 def test_images_are_spread_evenly_in_parallax() -> None:
     # The camera stands still for a while, then moves.
     centres = np.concatenate([np.zeros(20), np.linspace(0, 1, 21)])
-    options = ImageOptions(num_images=6, select="parallax")
-    frames = choose_frames(project(centres, np.zeros(41)), options)
+    frames = spread_in_parallax(project(centres, np.zeros(41)), 6)
     assert frames[0] == 0
     np.testing.assert_allclose(frames[1:], [24, 28, 32, 36, 40], atol=1)
 
 
 def test_blurred_frames_are_replaced_by_sharp_neighbours() -> None:
-    tracks = tracks_from(np.full((50, 41, 2), 10.0))
     sharp = np.full(41, 10.0)
     sharp[[10, 20, 21, 30]] = 1.0
     sharp[22] = 12.0
@@ -142,19 +141,8 @@ def test_blurred_frames_are_replaced_by_sharp_neighbours() -> None:
         return sharp[list(frames)]  # type: ignore[call-overload]
 
     frames = np.array([0, 10, 20, 30, 40], dtype=np.int32)
-    assert skip_blurred(frames, tracks, sharpness).tolist() == [0, 8, 22, 28, 40]
+    assert skip_blurred(frames, sharpness).tolist() == [0, 8, 22, 28, 40]
     assert asked == sorted(set(asked))
-    # A neighbour that lost most tracks is not a replacement.
-    lost = (tracks.frame == 22) & (np.repeat(np.arange(50), 41) > 5)
-    kept = ~lost
-    counts = np.bincount(np.repeat(np.arange(50), 41)[kept], minlength=50)
-    thinner = replace(
-        tracks,
-        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        frame=tracks.frame[kept],
-        xy=tracks.xy[kept],
-    )
-    assert skip_blurred(frames, thinner, sharpness).tolist() == [0, 8, 18, 28, 40]
 
 
 def test_frame_list_is_read(tmp_path: Path) -> None:
@@ -186,13 +174,13 @@ def test_invalid_frame_lists_are_refused(
     options = ImageOptions(frame_list=str(tmp_path / "list.txt"))
     with pytest.raises(ImageError, match=message):
         choose_images(
-            still(10), options, existing=(), folder=None, times=lambda: None, decode=lambda _: ()
+            10, options, existing=(), folder=None, times=lambda: None, decode=lambda _: ()
         )
 
 
 def test_fps_needs_frame_times() -> None:
     with pytest.raises(OptionError, match="time"):
-        choose_frames(still(10), ImageOptions(fps=2))
+        choose_frames(10, ImageOptions(fps=2))
 
 
 @pytest.fixture(scope="module")

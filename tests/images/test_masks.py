@@ -195,7 +195,7 @@ def test_unusable_masks_are_refused_in_one_line(
     def long_work(*_: object, **__: object) -> None:
         raise AssertionError("masks are refused before the long work")
 
-    monkeypatch.setattr("colmap_av1.images.preparing.track_images", long_work)
+    monkeypatch.setattr("colmap_av1.images.preparing.track_chosen_images", long_work)
     path = bad_masks(kind, tmp_path)
     words = ["match", "--database", str(tmp_path / "a.db"), "--video", str(clip)]
     assert main([*words, f"--mask_path={path}"]) == 2
