@@ -182,6 +182,14 @@ def test_walker_is_found_in_any_direction(velocity: tuple[float, float, float]) 
     assert np.mean(within[~scene.moves] > 0.5) < 0.12
 
 
+def test_projections_that_are_not_kept_are_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = made(WALKS[0])
+    cells = dynamic_cells(scene.placed, scene.views)
+    monkeypatch.setattr("colmap_av1.poses.dynamic.contradictions._MAX_KEPT", 0)
+    assert cells.any()
+    assert (dynamic_cells(scene.placed, scene.views) == cells).all()
+
+
 @pytest.mark.parametrize("drift", [0.0, 0.3])
 def test_static_scene_has_no_dynamic_cells(drift: float) -> None:
     """Occlusion by the box and drifting tracks on smooth surfaces do not count as motion."""

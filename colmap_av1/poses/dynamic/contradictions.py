@@ -54,6 +54,9 @@ _MIN_BEFORE = 4
 _THROUGH_SHARE = 0.5
 # Width in cells of a neighbourhood; odd.
 _AROUND = 3
+# Points are projected once into each image, and their projections are kept, if there are at most
+# this many. Otherwise they are projected again whenever they are needed.
+_MAX_KEPT = 40_000_000
 
 
 @dataclass(frozen=True)
@@ -190,12 +193,11 @@ class Contradictions:
         self._placed, self._num_threads = placed, num_threads
         by_image, bounds = grouped(placed.image, len(views))
         self._seen = [by_image[a:b] for a, b in itertools.pairwise(bounds)]
-        there = np.flatnonzero(np.isfinite(placed.xyz[:, 0]))
-
-        def show(index: int) -> _Shown:
-            return self._show(views[index], there, self._seen[index])
-
-        self._shown = list(map_on_threads(show, range(len(views)), num_threads))
+        self._views = views
+        self._there = np.flatnonzero(np.isfinite(placed.xyz[:, 0]))
+        self._kept: list[_Shown] | None = None
+        if len(views) * len(self._there) <= _MAX_KEPT:
+            self._kept = list(map_on_threads(self._show, range(len(views)), num_threads))
 
     @property
     def by_motion(self) -> _Bools:
@@ -231,9 +233,14 @@ class Contradictions:
         """
         agreeing = self._agreeing & ~left_out & (self._placed.lengths >= _LONG)
         found = np.zeros(self._placed.shape)
-        for own, shown in zip(found, self._shown, strict=True):
+
+        def count(image: int) -> None:
+            shown = self._shown(image)
             kept = agreeing[shown.track]
-            np.add.at(own, (shown.row[kept], shown.column[kept]), 1.0)
+            np.add.at(found[image], (shown.row[kept], shown.column[kept]), 1.0)
+
+        for _ in map_on_threads(count, range(len(found)), self._num_threads):
+            pass
         return found
 
     @property
@@ -241,12 +248,15 @@ class Contradictions:
         placed = self._placed
         return np.asarray((placed.residual < _AGREES) & np.isfinite(placed.xyz[:, 0]))
 
-    def _show(self, view: PosedCamera, there: _Ints, rows: _Ints) -> _Shown:
+    def _shown(self, image: int) -> _Shown:
+        return self._kept[image] if self._kept is not None else self._show(image)
+
+    def _show(self, image: int) -> _Shown:
         placed = self._placed
-        index, xy, depth = view.project(placed.xyz[there])
-        track = there[index]
+        index, xy, depth = self._views[image].project(placed.xyz[self._there])
+        track = self._there[index]
         is_seen = np.zeros(len(placed.xyz), np.bool_)
-        is_seen[placed.track[rows]] = True
+        is_seen[placed.track[self._seen[image]]] = True
         unseen = np.flatnonzero(~is_seen[track])
         # NumPy divides integers many times faster. Positions are at most 65,536.
         cell = (xy[unseen].astype(np.int32) // np.int32(placed.cell)).astype(np.int16)
@@ -262,7 +272,7 @@ class Contradictions:
 
         def hiding_in(image: int) -> tuple[NDArray[np.int32], _Bools]:
             """The tracks with enough points around them, and whether each would hide those."""
-            seen, shown = self._seen[image], self._shown[image]
+            seen, shown = self._seen[image], self._shown(image)
             own = seen[agreeing[placed.track[seen]]]
             at = placed.row[own] * columns + placed.column[own]
             in_cells = np.full(rows * columns, np.inf)
@@ -294,7 +304,7 @@ class Contradictions:
 
         def through_in(image: int) -> tuple[_Ints, _Bools]:
             """The tracks with points, and whether they are seen through a surface."""
-            rows, shown = self._seen[image], self._shown[image]
+            rows, shown = self._seen[image], self._shown(image)
             own = rows[np.isfinite(placed.depth[rows])]
             kept = agreeing[shown.track]
             proof = own[agreeing[placed.track[own]]]
