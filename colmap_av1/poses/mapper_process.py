@@ -77,6 +77,8 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
         how.mapper.abs_pose_refine_extra_params = refine
         if settings["tolerance"] is not None:
             how.ba_global_function_tolerance = settings["tolerance"]
+        if settings["growth"] is not None:
+            how.ba_global_frames_ratio = how.ba_global_points_ratio = settings["growth"]
         # pycolmap accepts None for a callback, although its stub does not declare it.
         callbacks: Any = {"initial_image_pair_callback": placed, "next_image_callback": placed}
         models = pycolmap.incremental_mapping(database, each, each, options=how, **callbacks)
