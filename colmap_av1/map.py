@@ -213,6 +213,7 @@ def _map(
                 log=log,
                 num_images=checked.num_images,
                 progress=progress,
+                effort="video",
             )
             shutil.copyfile(log, models / "mapper.log")
             attempts.append((num_registered, forward, models))

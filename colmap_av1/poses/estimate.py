@@ -28,7 +28,7 @@ from colmap_av1.poses.mapping_stage import (
     with_model_first,
 )
 from colmap_av1.poses.match_stage import MatchesResult, match_stage, matches_key, read_links
-from colmap_av1.poses.parts import split_stage
+from colmap_av1.poses.parts import certain_stage, split_stage
 from colmap_av1.poses.posed_images import PosesResult
 from colmap_av1.poses.remapping import remap_stage
 from colmap_av1.poses.resection_stage import resection_stage
@@ -261,28 +261,45 @@ def _larger_model(run: Run, mapped: _Mapped, size: int, image_set: ImageSet) -> 
     return others[0] if num_nearest(second, image_set, mapped.keyed) > size else None
 
 
-def split_at_seams(run: Run, posed: Posed, image_set: ImageSet) -> Posed:
+def split_at_seams(
+    run: Run, posed: Posed, image_set: ImageSet, *, only_certain: bool = False
+) -> Posed:
     """Split the model at seams with few points, and adjust the largest part separately.
 
     If pictures far apart in time contradict the poses, it is split at doubtful seams, too. The
     separate adjustment may change the number of points at a seam, so the seams of the largest part
     are checked again until no split is left. Motion across a seam is not used any more, because it
     may be wrong there. Links are: without them, a part that returns to a place would fall apart.
+
+    Args:
+        run: the run.
+        posed: the adjusted poses.
+        image_set: the images.
+        only_certain: also remove images whose positions are uncertain, see `certain_parts`.
+
+    Raises:
+        ModelError: too few images are certain.
     """
     for number in count(_FIRST_SPLIT):
-        seams = _seams_to_split(posed)
-        if posed.adjustment is None or not seams:
+        if posed.adjustment is None:
             break
-        parts = split_stage(
-            run,
-            image_set,
-            posed.mapped,
-            posed.adjustment,
-            seams,
-            rival=posed.rival,
-            number=number,
-        )
-        if parts.result.num_registered == posed.adjustment.result.num_registered:
+        seams, num_images = _seams_to_split(posed), posed.adjustment.result.num_registered
+        parts = posed.mapped
+        if seams:
+            parts = split_stage(
+                run,
+                image_set,
+                posed.mapped,
+                posed.adjustment,
+                seams,
+                rival=posed.rival,
+                number=number,
+            )
+        is_whole = not seams or parts.result.num_registered == num_images
+        if is_whole and only_certain:
+            parts = certain_stage(run, image_set, posed.mapped, posed.adjustment, number=number)
+            is_whole = parts.result.num_registered == num_images
+        if is_whole:
             break
         frame_of = image_set.images.frame_of
         frames = [frame_of[first] for first, _ in seams]

@@ -104,8 +104,8 @@ def further_poses(
             )
             if map_again:
                 posed = remapped_poses(own, posed, some, least_kept=_LEAST_KEPT)
-            posed = split_at_seams(own, posed, some)
-        except ModelError:  # too few tracks agree with these poses
+            posed = split_at_seams(own, posed, some, only_certain=True)
+        except ModelError:  # too few tracks agree with these poses, or the poses are uncertain
             continue
         waiting += _other_models(own, posed)
         new = _registered(own, posed) & left

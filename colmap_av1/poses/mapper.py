@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import read_model
@@ -33,6 +33,7 @@ _EARLY_TOLERANCE = 1e-4
 # instead of 0, the mapper takes two thirds of the time, and models are the same.
 _VIDEO_GROWTH = 1.4
 _VIDEO_TOLERANCE = 1e-6
+MapperEffort = Literal["full", "video", "early"]
 # The module is loaded from its file, since importing the whole package takes twice as long as
 # pycolmap. The path must not contain '': files in the working folder would shadow libraries.
 _CHILD = """
@@ -54,11 +55,9 @@ def map_poses(
     log: Path,
     num_images: int,
     progress: Progress,
-    ends_early: bool = False,
+    effort: MapperEffort = "full",
 ) -> tuple[int, ...]:
     """Map a database in a separate process, see `run_mapper`.
-
-    Global bundle adjustment is as frequent as in COLMAP's settings for videos.
 
     Args:
         database: COLMAP database with verified matches; pycolmap migrates it to its schema.
@@ -68,7 +67,9 @@ def map_poses(
         log: file for the output of the mapper.
         num_images: number of images, for the progress.
         progress: called in the stage "poses" with the number of images registered so far.
-        ends_early: end global bundle adjustment early, because the poses are adjusted later.
+        effort: how often and how exactly all images are adjusted. full: as by COLMAP's defaults;
+            video: as by its settings for videos; early: adjustment ends early, because the poses
+            are adjusted later.
 
     Returns:
         Number of registered images of each model, in descending order; empty if there is no model.
@@ -78,8 +79,10 @@ def map_poses(
     """
     output.mkdir(parents=True, exist_ok=True)
     settings = _mapping_settings(database, output, options, image_path)
-    settings["growth"] = _VIDEO_GROWTH
-    settings["tolerance"] = _EARLY_TOLERANCE if ends_early else _VIDEO_TOLERANCE
+    if effort == "video":
+        settings |= {"growth": _VIDEO_GROWTH, "tolerance": _VIDEO_TOLERANCE}
+    elif effort == "early":
+        settings["tolerance"] = _EARLY_TOLERANCE
     progress("poses", 0, num_images)
     sizes: list[int] = []
     placed = 0

@@ -21,7 +21,7 @@ from colmap_av1.geometry.posed_model import (
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.adjusting import refines_intrinsics, with_second_distortion
-from colmap_av1.poses.mapper import map_poses
+from colmap_av1.poses.mapper import MapperEffort, map_poses
 from colmap_av1.poses.match_stage import MatchesResult
 from colmap_av1.poses.posed_images import PosesResult, registered_by_video
 from colmap_av1.poses.run import Run
@@ -67,7 +67,7 @@ def mapping_stage(
     reasons = {reason for gap in links.gaps for reason in gap.reasons}
     depends_on_links = links.num_between or reasons & {"contradicted", "few tracks"}
     # Where poses depend on links, walks with fast turns bend if the mapper ends early.
-    ends_early = mapping.adjust and not depends_on_links
+    effort: MapperEffort = "early" if mapping.adjust and not depends_on_links else "full"
     attempts = [
         MapOptions(
             mapper=mapper,
@@ -89,7 +89,7 @@ def mapping_stage(
                 log=run.stages / "mapper.log",
                 num_images=len(keyed.images.names),
                 progress=progress,
-                ends_early=ends_early,
+                effort=effort,
             )
             found = [
                 posed_model(read_model(Path(models) / str(number)), with_points=True)
@@ -136,7 +136,7 @@ def mapping_stage(
             matched.digest,
             attempts,
             mapping.adjust,
-            ends_early,
+            effort,
         ],
         MappedResult,
         products=["poses"],

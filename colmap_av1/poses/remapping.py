@@ -198,7 +198,7 @@ def _map_tracks(
                 log=run.stages / "mapper.log",
                 num_images=len(known.images),
                 progress=run.progress,
-                ends_early=True,
+                effort="early",
             )
         except ModelError:  # the first mapping is there
             return None

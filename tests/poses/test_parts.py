@@ -21,7 +21,7 @@ from colmap_av1.geometry.colmap_model import (
 )
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.parts import parts_of
+from colmap_av1.poses.parts import certain_parts, parts_of
 from colmap_av1.reconstruct import reconstruct
 
 
@@ -139,6 +139,34 @@ def test_short_parts_are_dropped() -> None:
     short = images(12)
     parts = parts_of(model(short, [[0, 1]]), short, [seam(short, 6)])
     assert parts == [names(short, *range(7))]
+
+
+def seen_at(known: PosedModel, depths: list[float]) -> PosedModel:
+    """The model with points at these depths, observed where they are, with small errors."""
+    rng = np.random.default_rng(0)
+    points = known.points
+    first = points.image[points.offsets[:-1]]
+    across = rng.uniform(-0.4, 0.4, (len(depths), 2)) * np.array(depths)[:, None]
+    xyz = np.column_stack([first + 2 + across[:, 0], across[:, 1], depths])
+    owner = np.repeat(np.arange(len(depths)), np.diff(points.offsets))
+    local = xyz[owner] + np.array([i.cam_from_world[:, 3] for i in known.images])[points.image]
+    xy = known.cameras[1].img_from_cam(local) + rng.normal(0, 0.1, (len(owner), 2))
+    return replace(known, points=replace(points, xyz=xyz, xy=xy))
+
+
+def test_uncertain_images_at_an_end_are_removed() -> None:
+    image_set = images(24)
+    near = [[k, k + 1, k + 2, k + 3] for k in range(11) for _ in range(40)]
+    # Points that are so far away do not determine how far the camera moves.
+    far = [[k, k + 1, k + 2, k + 3] for k in range(10, 21) for _ in range(40)]
+    depths = [10.0] * len(near) + [1e5] * len(far)
+    known = seen_at(model(image_set, near + far), depths)
+    kept, *removed = certain_parts(known, image_set)
+    assert kept == names(image_set, *range(14))
+    assert removed == [names(image_set, *range(14, 24))]
+    whole = seen_at(model(image_set, near + far), [10.0] * len(depths))
+    assert certain_parts(whole, image_set) == [names(image_set, *range(24))]
+    assert certain_parts(seen_at(whole, [1e5] * len(depths)), image_set) == []
 
 
 @pytest.mark.slow

@@ -1,0 +1,111 @@
+"""How certain the camera positions of a model are."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_av1.geometry.colmap_model import camera_centres
+from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
+
+# Observations with a larger multiple of the median error are outliers.
+_OUTLIER = 4.0
+# Median of a Rayleigh distribution, that of the length of errors in two dimensions, in units of its
+# scale.
+_RAYLEIGH_MEDIAN = 1.1774
+# Added to the normal equations of points, as a share of their trace: points at infinity have no
+# depth.
+_DAMPING = 1e-9
+# Smallest eigenvalue of the normal equations that is not due to rounding, as a share of the
+# largest.
+_LEAST_EIGENVALUE = 1e-14
+# A similarity transform of the whole model, which no observation determines, has so many degrees of
+# freedom.
+_GAUGE = 7
+
+
+def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
+    """Expected errors of the camera centres that follow from errors of the observations.
+
+    They are the standard deviations of bundle adjustment of poses and points (Triggs et al., Bundle
+    Adjustment - A Modern Synthesis, 2000), after similarity alignment of the centres. Errors of
+    observations are assumed to be independent and as large as those of the model. Errors of tracks
+    are not independent: on rendered walks, the actual errors were 2 to 20 times the expected ones.
+
+    Args:
+        model: a model of two images or more, with points.
+
+    Returns:
+        float64 [num_images] in units of the diagonal of the bounding box of all centres; very large
+        where observations do not determine a pose.
+    """
+    from scipy.linalg import eigh  # noqa: PLC0415 - slow to import
+    from scipy.sparse import block_diag, bsr_matrix  # noqa: PLC0415
+
+    points, num_images = model.points, len(model.images)
+    errors = reprojection_errors(model)
+    median = float(np.median(errors)) if len(errors) else 0.0
+    kept = np.isfinite(errors) & (errors <= _OUTLIER * median)
+    point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))[kept]
+    image = points.image[kept].astype(np.int64)
+    rotation = np.array([own.cam_from_world[:, :3] for own in model.images])
+    translation = np.array([own.cam_from_world[:, 3] for own in model.images])
+    focal = np.array([model.cameras[own.camera_id].mean_focal_length() for own in model.images])
+
+    # An observation measures the direction of its ray, by two angles of one pixel per focal length.
+    ray = np.einsum("nij,nj->ni", rotation[image], points.xyz[point]) + translation[image]
+    depth = np.linalg.norm(ray, axis=1)
+    unit = ray / depth[:, None]
+    across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
+    by_ray = across * (focal[image] / depth)[:, None, None]
+    by_pose = np.concatenate([-by_ray @ _cross(ray), by_ray], axis=2)
+    by_point = by_ray @ rotation[image]
+
+    # Normal equations, from which the points are eliminated.
+    of_poses = np.zeros((num_images, 6, 6))
+    np.add.at(of_poses, image, by_pose.transpose(0, 2, 1) @ by_pose)
+    of_points = np.zeros((len(points.xyz), 3, 3))
+    np.add.at(of_points, point, by_point.transpose(0, 2, 1) @ by_point)
+    of_points += (_DAMPING * np.trace(of_points, axis1=1, axis2=2) + 1e-30)[:, None, None] * np.eye(
+        3
+    )
+    mixed = by_pose.transpose(0, 2, 1) @ by_point
+    order = np.lexsort([point, image])
+    rows = np.searchsorted(image[order], np.arange(num_images + 1))
+    shape = (6 * num_images, 3 * len(points.xyz))
+    one = bsr_matrix((mixed[order], point[order], rows), shape=shape)
+    eliminated = mixed @ np.linalg.inv(of_points)[point]
+    other = bsr_matrix((eliminated[order], point[order], rows), shape=shape)
+    normal = (block_diag(of_poses) - other @ one.T).toarray()
+
+    # Errors of the centres by eigenvectors of the poses, without the similarity transform.
+    eigenvalues, vectors = eigh((normal + normal.T) / 2)
+    centres = camera_centres(np.array([own.cam_from_world for own in model.images]))
+    moves = -np.einsum(
+        "nji,njk->nik", rotation, vectors.reshape(num_images, 6, -1)[:, 3:, _GAUGE:]
+    ).reshape(3 * num_images, -1)
+    similarity = _similarity_moves(centres)
+    moves -= similarity @ (similarity.T @ moves)
+    least = _LEAST_EIGENVALUE * eigenvalues[-1]
+    variance = (moves**2 / np.maximum(eigenvalues[_GAUGE:], least)).sum(axis=1)
+    extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
+    sigma = median / _RAYLEIGH_MEDIAN
+    return np.asarray(sigma / extent * np.sqrt(variance.reshape(-1, 3).sum(axis=1)))
+
+
+def _cross(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrices [n, 3, 3] of cross products with vectors [n, 3]."""
+    x, y, z = vectors.T
+    zero = np.zeros(len(vectors))
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return np.asarray(np.stack([np.stack(row, axis=1) for row in rows], axis=1))
+
+
+def _similarity_moves(centres: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Orthonormal basis [3 n, 7] of the moves of centres [n, 3] by similarity transforms."""
+    relative = centres - centres.mean(axis=0)
+    moves = np.zeros((len(centres), 3, _GAUGE))
+    moves[:, :, :3] = np.eye(3)
+    moves[:, :, 3:6] = _cross(relative)
+    moves[:, :, 6] = relative
+    return np.asarray(np.linalg.qr(moves.reshape(-1, _GAUGE))[0])
