@@ -236,7 +236,7 @@ def _track(
         found = track_chosen_images(
             source,
             replace(matching.tracking, tracks=chaining),
-            ImageChoice(matching.images, images.names, images.folder),
+            ImageChoice(matching.images, images.names, images.folder, of_model=True),
             masks=images.masks,
             every_frame=False,
             context=context,

@@ -79,6 +79,17 @@ def test_densify_gives_correct_depths_and_colours(
     assert np.median(np.abs(off)) < 10
 
 
+def test_list_of_frames_may_have_images_that_the_model_lacks(truth: Truth, tmp_path: Path) -> None:
+    model = true_model(tmp_path / "model", truth, range(0, 40, 4))
+    listed = tmp_path / "frames.txt"
+    listed.write_text("".join(f"{frame} {frame:04d}.png\n" for frame in range(0, 60, 4)))
+    options = DensifyOptions(match=MatchOptions(images=ImageOptions(frame_list=listed)))
+    assert densify(model, SCENE, tmp_path / "dense", options=options).num_images == 10
+    listed.write_text("0 0000.png\n4 0004.png\n")
+    with pytest.raises(ImageError, match="list"):
+        densify(model, SCENE, tmp_path / "few", options=options)
+
+
 def test_points_lie_on_the_surfaces(truth: Truth, dense: pycolmap.Reconstruction) -> None:
     """Including points observed in three frames; errors are relative to the camera distance."""
     points = list(dense.points3D.values())

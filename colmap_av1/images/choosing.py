@@ -83,6 +83,7 @@ def choose_images(
     times: Callable[[], NDArray[np.float64] | None],
     decode: _Decode,
     tracks: Tracks | None = None,
+    of_model: bool = False,
 ) -> ChosenImages:
     """Choose the frames that become images: the frames of existing images, else by the options.
 
@@ -100,6 +101,7 @@ def choose_images(
         decode: yields (display index, picture) of some frames, given by their indices, or with
             None of all frames.
         tracks: tracks through all frames if new images are spread in parallax; else None.
+        of_model: the existing images are those of a model, so `frame_list` may list more.
 
     Raises:
         ImageError: the frames of the existing images cannot be determined, or fewer than two are
@@ -107,7 +109,7 @@ def choose_images(
         OptionError: an option does not apply to existing images, or `fps` needs times.
     """
     if existing:
-        chosen = _find_existing(num_frames, options, existing, folder, decode)
+        chosen = _find_existing(num_frames, options, existing, folder, decode, of_model=of_model)
     elif options.frame_list is not None:
         chosen = read_frame_list(options.frame_list, num_frames, options)
         for name in chosen.names:
@@ -320,6 +322,8 @@ def _find_existing(
     names: Sequence[str],
     folder: Path | None,
     decode: _Decode,
+    *,
+    of_model: bool,
 ) -> ChosenImages:
     """Find the frames of existing images."""
     wrong = next((n for n in ("num_images", "fps") if getattr(options, n) is not None), None)
@@ -334,6 +338,8 @@ def _find_existing(
         files = []
     if options.frame_list is not None:
         chosen = read_frame_list(options.frame_list, num_frames, options)
+        if of_model:  # a model may lack some of the images
+            chosen = chosen.some(np.flatnonzero(np.isin(chosen.names, names)))
         odd = sorted(set(names) ^ set(chosen.names))
         if odd:
             where = "has no image" if odd[0] in chosen.names else f"{options.frame_list} has no"

@@ -63,12 +63,14 @@ class ImageChoice:
         existing: names of existing images.
         folder: folder of the images; None: no picture is decoded.
         display: how images show the pictures; None: as players do.
+        of_model: the existing images are those of a model, see `choose_images`.
     """
 
     options: ImageOptions
     existing: Sequence[str] = ()
     folder: Path | None = None
     display: Display | None = None
+    of_model: bool = False
 
     @property
     def needs_tracks(self) -> bool:
@@ -130,6 +132,7 @@ def track_chosen_images(
                 source, num_frames, options.read, choice.display, wanted=wanted, context=context
             ),
             tracks=tracks,
+            of_model=choice.of_model,
         )
 
     if choice.needs_tracks:

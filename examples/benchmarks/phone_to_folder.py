@@ -41,6 +41,7 @@ from colmap_av1 import (
     MapOptions,
     MatchOptions,
     ReconstructOptions,
+    map_database,
     match,
     reconstruct,
 )
@@ -198,8 +199,13 @@ def measure_match(clip: Clip, folder: Path) -> list[Row]:
     def fill() -> dict[str, Any]:
         options = MatchOptions(images=clip.images, camera=clip.camera)
         run = run_measured(run_match, clip.video, database, images, options, log=log)
-        num_images, command = run.result
-        return {"taken": taken(run), "num_images": num_images, "command": command}
+        num_images, command, settings = run.result
+        return {
+            "taken": taken(run),
+            "num_images": num_images,
+            "command": command,
+            "settings": settings,
+        }
 
     given = [file_digest(clip.video), clip.images, clip.camera, pycolmap.__version__]
     made = run_stage_in(database.parent, given, fill, products=[database, images], timed=True)
@@ -213,11 +219,18 @@ def measure_match(clip: Clip, folder: Path) -> list[Row]:
     copy, output = folder / "copy.db", folder / "pycolmap"
     shutil.copyfile(database, copy)
     shutil.rmtree(output, ignore_errors=True)
+    settings = MapOptions(**made.result["settings"])
+    by_map = folder / "map"
+    shutil.rmtree(by_map, ignore_errors=True)
     runs = {
         render.MATCH_PYCOLMAP: (
             run_measured(map_incrementally, copy, images, output, command, log=log),
             output / "0",
-        )
+        ),
+        render.MATCH_MAP: (
+            run_measured(run_map, database, images, by_map, settings, log=log),
+            by_map / "0",
+        ),
     }
     if shutil.which("colmap") is not None:
         runs[render.MATCH_COLMAP] = (run_measured(run_command, command, log=log), printed / "0")
@@ -225,17 +238,27 @@ def measure_match(clip: Clip, folder: Path) -> list[Row]:
         mapper = row_of(clip, f"{way}: mapper", taken(run))
         total = replace(sum_of(way, [matched, mapper]), images=num_images)
         if model.is_dir():
-            straight = undistorted(model, images, folder / "undistorted")
-            figures = figures_of(clip, model, None, num_images) | ruler.long_range(*straight)
-            total = replace(total, **figures)
+            total = replace(total, **figures_on(clip, model, images, folder, num_images))
         rows += [mapper, total]
     return rows
 
 
-def run_match(video: Path, database: Path, images: Path, options: MatchOptions) -> tuple[int, str]:
-    """The number of images of a new database, and the command for COLMAP that `match` prints."""
+def run_match(
+    video: Path, database: Path, images: Path, options: MatchOptions
+) -> tuple[int, str, dict[str, Any]]:
+    """Fill a new database.
+
+    Returns:
+        The number of images, and the command for COLMAP and the options of `map` that `match`
+        prints.
+    """
     report = match(database, video, image_path=images, options=options)
-    return report.num_images, report.next_commands[0]
+    return report.num_images, report.next_commands[0], asdict(report.map_options)
+
+
+def run_map(database: Path, images: Path, output: Path, options: MapOptions) -> None:
+    """Map a database by `map`."""
+    map_database(database, images, output, options=options)
 
 
 def run_command(words: str) -> None:
@@ -247,12 +270,20 @@ def measure_sift(clip: Clip, folder: Path, names: list[str], *, mapped: bool) ->
     """Rows of the steps of SIFT on the same images, and their total."""
     steps, model, images = sift_of(clip, folder, names, mapped=mapped)
     rows = [row_of(clip, f"SIFT: {name}", step) for name, step in steps.items()]
-    total = replace(sum_of("SIFT sequential", rows), images=len(names))
-    if model is not None:
-        straight = undistorted(model, images, folder / "undistorted")
-        figures = figures_of(clip, model, None, len(names)) | ruler.long_range(*straight)
-        total = replace(total, **figures)
-    return [*rows, total]
+    total = replace(sum_of(render.SIFT_FROM_FILE, rows), images=len(names))
+    if model is None:
+        return [*rows, total]
+    before_mapper = rows[:-1]
+    rows.append(replace(total, **figures_on(clip, model, images, folder, len(names))))
+    output = folder / "map"
+    shutil.rmtree(output, ignore_errors=True)
+    settings = MapOptions(refine_intrinsics=clip.camera.camera_params is None)
+    database = folder / "features" / "database.db"
+    run = run_measured(run_map, database, images, output, settings, log=folder / "log")
+    mapper = row_of(clip, f"{render.SIFT_MAP}: mapper", taken(run))
+    total = replace(sum_of(render.SIFT_MAP, [*before_mapper, mapper]), images=len(names))
+    figures = figures_on(clip, output / "0", images, folder, len(names))
+    return [*rows, mapper, replace(total, **figures)]
 
 
 def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any], Path]:
@@ -394,6 +425,14 @@ def sum_of(way: str, steps: list[Row]) -> Row:
         seconds=sum(step.seconds for step in steps),
         memory_mb=max(step.memory_mb or 0 for step in steps),
     )
+
+
+def figures_on(
+    clip: Clip, model: Path, images: Path, folder: Path, num_images: int
+) -> dict[str, Any]:
+    """Fields of Row for a model of distorted images; `folder` gets undistorted ones."""
+    straight = undistorted(model, images, folder / "undistorted")
+    return figures_of(clip, model, None, num_images) | ruler.long_range(*straight)
 
 
 def figures_of(clip: Clip, model: Path, images: Path | None, num_images: int) -> dict[str, Any]:

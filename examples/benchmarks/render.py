@@ -239,6 +239,8 @@ STRAIGHT = 0.5
 # Ways of `phone_to_folder.py`: from the file, from the AV1 stream, and SIFT for comparison.
 FROM_FILE, FROM_STREAM, SIFT_FROM_FILE = "reconstruct", "reconstruct from AV1", "SIFT sequential"
 MATCH_PYCOLMAP, MATCH_COLMAP = "match, pycolmap", "match, COLMAP"
+# With COLMAP's settings for videos.
+MATCH_MAP, SIFT_MAP = "match, map", "SIFT, map"
 
 
 def phone_to_folder(rows: list[Row]) -> str:
@@ -246,6 +248,8 @@ def phone_to_folder(rows: list[Row]) -> str:
     by_way = {(row["clip"], row["way"]): row for row in rows}
     ways = {
         SIFT_FROM_FILE: "SIFT, pycolmap",
+        SIFT_MAP: "SIFT, `map`",
+        MATCH_MAP: "`match`, `map`",
         MATCH_PYCOLMAP: "`match`, pycolmap",
         MATCH_COLMAP: "`match`, COLMAP 3.8",
         FROM_FILE: "`reconstruct`",
@@ -348,7 +352,7 @@ def phone_to_folder_steps(rows: list[Row]) -> str:
     return f"{markdown(columns, [{'clip': clip} for clip in clips])}\n{measured_at(rows, 'clip')}"
 
 
-_WHOLE = (FROM_FILE, SIFT_FROM_FILE, MATCH_PYCOLMAP, MATCH_COLMAP)
+_WHOLE = (FROM_FILE, SIFT_FROM_FILE, SIFT_MAP, MATCH_MAP, MATCH_PYCOLMAP, MATCH_COLMAP)
 # Prefix of ways that are stages of `reconstruct`.
 STAGE = "stage: "
 _NOTABLE = 0.05  # Smallest CPU time in seconds of a stage in the table.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -127,19 +126,18 @@ def choose_footage(
     return Footage(video=video.path, image_path=images, camera=options.camera, **facts)
 
 
-def frame_list(footage: Footage, path: Path, names: Collection[str] | None = None) -> str:
+def frame_list(footage: Footage, path: Path) -> str:
     """Write the frame and name of each image, in the format of `ImageOptions.frame_list`.
 
     Args:
         footage: the images.
         path: the file.
-        names: names of the images to list; all if None.
 
     Returns:
         The file's path.
     """
     each = zip(footage.frames, footage.names, strict=True)
-    path.write_text("".join(f"{f} {n}\n" for f, n in each if names is None or n in names))
+    path.write_text("".join(f"{frame} {name}\n" for frame, name in each))
     return str(path)
 
 

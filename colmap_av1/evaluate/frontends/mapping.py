@@ -13,7 +13,6 @@ from colmap_av1.densify import densify
 from colmap_av1.evaluate.frontends.footage import Footage, frame_list
 from colmap_av1.evaluate.frontends.frontend import OF_OTHERS
 from colmap_av1.evaluate.frontends.measure import run_measured
-from colmap_av1.geometry.colmap_model import posed_images, read_model
 from colmap_av1.options import DensifyOptions, ImageOptions, MapOptions
 from colmap_av1.poses.mapper import run_mapper
 from colmap_av1.util.digests import file_digest
@@ -100,8 +99,7 @@ def densify_model(
     output = folder / "model"
 
     def make() -> dict[str, Any]:
-        registered = set(posed_images(read_model(model)))
-        images = ImageOptions(frame_list=frame_list(footage, folder / "frames.txt", registered))
+        images = ImageOptions(frame_list=frame_list(footage, folder / "frames.txt"))
         given = replace(options, match=replace(options.match, images=images))
         measured = run_measured(
             _densify, model, footage.video, output, given, log=folder / "log.txt"
