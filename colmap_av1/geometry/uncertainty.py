@@ -39,7 +39,7 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
         float64 [num_images] in units of the diagonal of the bounding box of all centres; very large
         where observations do not determine a pose.
     """
-    from scipy.linalg import eigh  # noqa: PLC0415 - slow to import
+    from scipy.linalg import cholesky, solve_triangular  # noqa: PLC0415 - slow to import
     from scipy.sparse import block_diag, bsr_matrix  # noqa: PLC0415
 
     points, num_images = model.points, len(model.images)
@@ -77,20 +77,24 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
     eliminated = mixed @ np.linalg.inv(of_points)[point]
     other = bsr_matrix((eliminated[order], point[order], rows), shape=shape)
     normal = (block_diag(of_poses) - other @ one.T).toarray()
+    normal = (normal + normal.T) / 2
 
-    # Errors of the centres by eigenvectors of the poses, without the similarity transform.
-    eigenvalues, vectors = eigh((normal + normal.T) / 2)
+    # Errors of the centres, without those that a similarity transform of the whole model explains.
     centres = camera_centres(np.array([own.cam_from_world for own in model.images]))
-    moves = -np.einsum(
-        "nji,njk->nik", rotation, vectors.reshape(num_images, 6, -1)[:, 3:, _GAUGE:]
-    ).reshape(3 * num_images, -1)
+    gauge = _gauge(rotation, translation)
+    largest = float(np.diag(normal).max())
+    ridge = _LEAST_EIGENVALUE * largest * np.eye(len(normal))
+    root = cholesky(normal + ridge + largest * gauge @ gauge.T, lower=True)
+    moves = np.zeros((num_images, 3, num_images, 6))
+    each = np.arange(num_images)
+    moves[each, :, each, 3:] = -rotation.transpose(0, 2, 1)
     similarity = _similarity_moves(centres)
+    moves = moves.reshape(3 * num_images, -1)
     moves -= similarity @ (similarity.T @ moves)
-    least = _LEAST_EIGENVALUE * eigenvalues[-1]
-    variance = (moves**2 / np.maximum(eigenvalues[_GAUGE:], least)).sum(axis=1)
+    deviations = solve_triangular(root, moves.T, lower=True)
+    variance = (deviations**2).sum(axis=0).reshape(-1, 3).sum(axis=1)
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
-    sigma = median / _RAYLEIGH_MEDIAN
-    return np.asarray(sigma / extent * np.sqrt(variance.reshape(-1, 3).sum(axis=1)))
+    return np.asarray(median / _RAYLEIGH_MEDIAN / extent * np.sqrt(variance))
 
 
 def _cross(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -99,6 +103,16 @@ def _cross(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     zero = np.zeros(len(vectors))
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
     return np.asarray(np.stack([np.stack(row, axis=1) for row in rows], axis=1))
+
+
+def _gauge(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Orthonormal basis [6 n, 7] of the pose changes that follow a similarity transform."""
+    changes = np.zeros((len(rotation), 6, _GAUGE))
+    changes[:, 3:, :3] = rotation
+    changes[:, :3, 3:6] = rotation
+    changes[:, 3:, 3:6] = _cross(translation) @ rotation
+    changes[:, 3:, 6] = translation
+    return np.asarray(np.linalg.qr(changes.reshape(-1, _GAUGE))[0])
 
 
 def _similarity_moves(centres: NDArray[np.float64]) -> NDArray[np.float64]:
