@@ -14,13 +14,15 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 from numpy.typing import NDArray
 
 from colmap_av1.check.database import DatabaseCheck, check_database
-from colmap_av1.check.model import check_model
+from colmap_av1.check.model import check_model, uncertainty_warning
 from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_images, read_pose_priors
 from colmap_av1.errors import DatabaseError, ImageError, ModelError, OptionError, cannot_write
 from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
+from colmap_av1.geometry.posed_model import posed_model
+from colmap_av1.geometry.uncertainty import CERTAIN, expected_error
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
 from colmap_av1.matching.few_matches import few_matches_warning
@@ -54,6 +56,8 @@ class MapReport:
         place: coordinates of the model in folder 0: units, axes, origin and their source, as in
             `place.json`.
         figures: figures of the model in folder 0.
+        expected_error: expected error of its camera centres as a share of their extent; None if it
+            is not known.
         long_range: result of the long-range check of this model; None if its images cannot be read.
         seconds: wall time of each stage.
         warnings: warnings for the user.
@@ -67,6 +71,7 @@ class MapReport:
     num_registered: tuple[int, ...]
     place: Place
     figures: ModelFigures
+    expected_error: float | None
     long_range: LongRangeErrors | None
     seconds: dict[str, float]
     warnings: tuple[str, ...]
@@ -162,6 +167,8 @@ def map_database(
         # Seams of the model are more specific than gaps of the matches.
         *(found.seam_warnings or (few_matches_warning(checked.few_match_gaps),)),
         found.long_range.warning() if found.long_range else unreadable,
+        uncertainty_warning(found.expected_error),
+        *_uncertain_models(output, len(num_registered)),
     )
     return MapReport(
         output=output,
@@ -172,6 +179,7 @@ def map_database(
         num_registered=num_registered,
         place=placement.place,
         figures=found.figures,
+        expected_error=found.expected_error,
         long_range=found.long_range,
         seconds=clock.seconds,
         warnings=tuple(warning for warning in warnings if warning is not None),
@@ -239,6 +247,18 @@ def _log() -> Iterator[Path]:
         os.unlink(name)
         raise
     os.unlink(name)
+
+
+def _uncertain_models(output: Path, num_models: int) -> list[str]:
+    """A warning about further models whose camera positions are uncertain, if there are any."""
+    uncertain = []
+    for number in range(1, num_models):
+        error = expected_error(posed_model(read_model(output / str(number)), with_points=True))
+        if error is not None and error > CERTAIN:
+            uncertain.append(f"'{number}'")
+    if not uncertain:
+        return []
+    return [f"few points with parallax determine the camera positions of {', '.join(uncertain)}"]
 
 
 def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:

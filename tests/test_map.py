@@ -86,6 +86,7 @@ def test_model_has_all_images_and_correct_poses(
     model = read_model(report.model)
     assert report.figures.num_points == model.num_points3D() > 300
     assert report.figures.mean_error == pytest.approx(model.compute_mean_reprojection_error())
+    assert report.expected_error < 0.001
     assert pose_errors(model_poses(model, 60), truth.cam_from_world).rotation < 1
     colours = np.array([point.color for point in model.points3D.values()])
     assert 50 < colours.mean() < 200

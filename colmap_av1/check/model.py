@@ -14,6 +14,7 @@ from colmap_av1.check.model_figures import ModelFigures, model_figures
 from colmap_av1.database.file import open_unaltered
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.posed_model import posed_model
+from colmap_av1.geometry.uncertainty import CERTAIN, expected_error
 from colmap_av1.poses.long_range import LongRangeErrors, model_long_range_errors
 from colmap_av1.poses.seams import Seams, model_seams
 from colmap_av1.util.progress import Progress, no_progress
@@ -26,12 +27,15 @@ class ModelCheck:
     Attributes:
         figures: numbers of images and points, errors and focal length.
         seams: the points that join neighbouring images.
+        expected_error: expected error of the camera centres as a share of their extent, see
+            `expected_error`; None if it is not known.
         crossings: the matches across neighbouring images; None without a database.
         long_range: the long-range check; None without an image folder.
     """
 
     figures: ModelFigures
     seams: Seams
+    expected_error: float | None
     crossings: Crossings | None
     long_range: LongRangeErrors | None
 
@@ -45,7 +49,18 @@ class ModelCheck:
     def warnings(self) -> tuple[str, ...]:
         """All warnings; none if nothing is wrong with the model."""
         far_warning = self.long_range.warning() if self.long_range else None
-        return (*((far_warning,) if far_warning is not None else ()), *self.seam_warnings)
+        found = (far_warning, uncertainty_warning(self.expected_error))
+        return (*(warning for warning in found if warning is not None), *self.seam_warnings)
+
+
+def uncertainty_warning(expected_error: float | None) -> str | None:
+    """Warning about uncertain camera positions."""
+    if expected_error is None or expected_error <= CERTAIN:
+        return None
+    return (
+        f"few points with parallax determine the camera positions: expect errors of "
+        f"{expected_error:.1%} of their extent or more; move sideways more while filming"
+    )
 
 
 def check_model(
@@ -84,9 +99,11 @@ def check_model(
     if database is not None:
         with open_unaltered(Path(database)) as connection:
             mapped = [name for (name,) in connection.execute("SELECT name FROM images")]
+    posed = posed_model(model, with_points=True)
     return ModelCheck(
         figures=model_figures(model),
-        seams=model_seams(posed_model(model, with_points=True), all_images=mapped),
+        seams=model_seams(posed, all_images=mapped),
+        expected_error=expected_error(posed),
         crossings=None if database is None else model_crossings(model, Path(database)),
         long_range=long_range,
     )

@@ -90,6 +90,7 @@ def map_rows(report: MapReport) -> Rows:
         ("mean reprojection error", f"{figures.mean_error:.3f} px"),
         ("mean track length", f"{figures.mean_track_length:.2f}"),
         _focal_length_row(figures.focal_lengths),
+        *_expected_error_row(report.expected_error),
     ]
     if report.long_range is not None:
         rows += _long_range_rows(report.long_range.median, report.long_range.largest)
@@ -106,6 +107,13 @@ def _focal_length_row(focal_lengths: tuple[float, float]) -> tuple[str, str]:
     if longest - shortest < _SAME_FOCAL_LENGTH * longest:
         return ("focal length", f"{(shortest + longest) / 2:.2f} px")
     return ("focal lengths", f"{shortest:.2f} to {longest:.2f} px")
+
+
+def _expected_error_row(expected_error: float | None) -> Rows:
+    """Expected error of the camera positions; no row if it is not known."""
+    if expected_error is None:
+        return []
+    return [("camera positions", f"expected error {expected_error:.3%} of their extent")]
 
 
 def reconstruct_rows(report: ReconstructReport) -> Rows:
@@ -184,6 +192,7 @@ def model_rows(found: ModelCheck) -> Rows:
         ("mean reprojection error", f"{figures.mean_error:.3f} px"),
         *(_long_range_rows(long_range.median, long_range.largest) if long_range else ()),
         _focal_length_row(figures.focal_lengths),
+        *_expected_error_row(found.expected_error),
     ]
 
 

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.colmap_model import camera_centres
+from colmap_av1.geometry.colmap_model import camera_centres, keep_observations
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 
+# Largest expected error of the camera centres of a model that is certain, as a share of their
+# extent. Of 51 models of rendered walks, those below it were off by at most 0.26 % of their extent,
+# and those above by up to 23 %. Eight clips have 0.003 to 0.06 %.
+CERTAIN = 0.001
+# Models with more images are not examined, which would take long.
+_MAX_IMAGES = 500
+# The expected error of a model with more observations is estimated from some of its points.
+_MAX_OBSERVATIONS = 300_000
 # Observations with a larger multiple of the median error are outliers.
 _OUTLIER = 4.0
 # Median of a Rayleigh distribution, that of the length of errors in two dimensions, in units of its
@@ -22,6 +33,27 @@ _LEAST_EIGENVALUE = 1e-14
 # A similarity transform of the whole model, which no observation determines, has so many degrees of
 # freedom.
 _GAUGE = 7
+
+
+def expected_error(model: PosedModel) -> float | None:
+    """Expected error of the camera centres of a model, see `centre_uncertainty`.
+
+    Args:
+        model: a model with points.
+
+    Returns:
+        The root mean square over the images, as a share of the extent of the centres. None for
+        models of one image or of more than 500.
+    """
+    if not 2 <= len(model.images) <= _MAX_IMAGES:
+        return None
+    points = model.points
+    # The information of independent observations adds up.
+    every = max(1, math.ceil(len(points.image) / _MAX_OBSERVATIONS))
+    some = np.arange(len(points.xyz)) % every == 0
+    kept, _ = keep_observations(points, np.repeat(some, np.diff(points.offsets)))
+    errors = centre_uncertainty(replace(model, points=kept)) / math.sqrt(every)
+    return float(np.sqrt(np.mean(errors**2)))
 
 
 def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
@@ -85,11 +117,11 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
     largest = float(np.diag(normal).max())
     ridge = _LEAST_EIGENVALUE * largest * np.eye(len(normal))
     root = cholesky(normal + ridge + largest * gauge @ gauge.T, lower=True)
-    moves = np.zeros((num_images, 3, num_images, 6))
+    by_translation = np.zeros((num_images, 3, num_images, 6))
     each = np.arange(num_images)
-    moves[each, :, each, 3:] = -rotation.transpose(0, 2, 1)
+    by_translation[each, :, each, 3:] = -rotation.transpose(0, 2, 1)
+    moves = by_translation.reshape(3 * num_images, -1)
     similarity = _similarity_moves(centres)
-    moves = moves.reshape(3 * num_images, -1)
     moves -= similarity @ (similarity.T @ moves)
     deviations = solve_triangular(root, moves.T, lower=True)
     variance = (deviations**2).sum(axis=0).reshape(-1, 3).sum(axis=1)

@@ -62,6 +62,7 @@ def further_poses(
     read_tracks: Callable[[], Sequence[Tracks]],
     *,
     map_again: bool,
+    left_out: set[str] | None = None,
 ) -> Iterator[FurtherPoses]:
     """Yield the poses of the models that are not connected to the first.
 
@@ -76,6 +77,8 @@ def further_poses(
         read_tracks: reads the tracks of each video. They are large, so they are not kept between
             the models.
         map_again: map the models again from their observations, see `remapping`.
+        left_out: gets the names of the images that the mapper registered, but whose poses are
+            uncertain or have too few tracks.
     """
     first_model = read_posed_model(run.stages / first.last.result.poses)
     left = set(image_set.images.names) - first_model.by_name.keys()
@@ -105,10 +108,14 @@ def further_poses(
             if map_again:
                 posed = remapped_poses(own, posed, some, least_kept=_LEAST_KEPT)
             posed = split_at_seams(own, posed, some, only_certain=True)
+            new = _registered(own, posed) & left
         except ModelError:  # too few tracks agree with these poses, or the poses are uncertain
+            posed, new = None, set[str]()
+        if left_out is not None:
+            left_out |= (known & left) - new
+        if posed is None:
             continue
         waiting += _other_models(own, posed)
-        new = _registered(own, posed) & left
         if len(new) < FEWEST_IMAGES:
             continue
         number += 1

@@ -67,7 +67,7 @@ _SIFT_CONTRAST = 0.02
 _SAME_POINT = 1.0
 # Two tracks of one video this close to each other, in pixels, are the same.
 _SAME_TRACK = 0.01
-# If a larger share of the images is not registered, the estimate has failed.
+# If a larger share of the images is not registered by a mapper, the estimate has failed.
 _MAX_LEFT = 0.5
 # Largest number of matches of the initial pair.
 _MAX_INITIAL_MATCHES = 300
@@ -135,8 +135,14 @@ def match_jointly(
     far = posed.long_range.result if posed.long_range is not None else None
     models = [_model_of(run, posed, image_set)]
     # A second mapping would join images across turns, which the mapper of the database then bends.
+    left_out = set[str]()
     further = further_poses(
-        run, posed, image_set, lambda: [v.tracks for v in videos], map_again=False
+        run,
+        posed,
+        image_set,
+        lambda: [v.tracks for v in videos],
+        map_again=False,
+        left_out=left_out,
     )
     for own in further:
         models.append(_model_of(own.run, own.posed, own.image_set))
@@ -145,7 +151,8 @@ def match_jointly(
     registered = {image.name for model in models for image in model.placed.images}
     left = [name for name in image_set.images.names if name not in registered]
     num_images = len(image_set.sequence)
-    if len(left) > _MAX_LEFT * num_images:
+    # Images of uncertain models do not count: without the estimate, their models would be bent.
+    if len(left_out.union(registered)) < (1 - _MAX_LEFT) * num_images:
         raise ModelError(
             f"the joint estimate registers only {num_images - len(left)} of {num_images} images: "
             "match them pair by pair with --verify pairs"

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import camera_centres, keep_observations
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
-from colmap_av1.geometry.uncertainty import centre_uncertainty
+from colmap_av1.geometry.uncertainty import CERTAIN, centre_uncertainty
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.mapping_stage import MappedResult
@@ -49,10 +49,6 @@ _BETWEEN_VIDEOS = 15
 # with 20 or more such points differed by 5 % at most. Those of stretches with no such point
 # differed by up to a factor of 2.7, although they had 100 to 340 points in common.
 _WITHIN_VIDEO = 20
-# Largest expected error of the camera centres of a model that is certain (root mean square), see
-# `centre_uncertainty`. Of 51 models of rendered walks, those below it were off by at most 0.26 %
-# of their extent, and those above by up to 23 %. Eight clips have 0.003 to 0.06 %.
-_CERTAIN = 0.001
 # One in this many images, at least one, is removed at a time until a model is certain.
 _REMOVED = 20
 
@@ -188,7 +184,7 @@ def certain_parts(model: PosedModel, image_set: ImageSet) -> list[AbstractSet[st
         part = _with_images(model, set(names[kept].tolist()))
         error_of = dict(zip(part.by_name, centre_uncertainty(part).tolist(), strict=True))
         errors = np.array([error_of.get(name, 0.0) for name in names.tolist()])
-        if np.sqrt(np.mean(errors[kept] ** 2)) <= _CERTAIN:
+        if np.sqrt(np.mean(errors[kept] ** 2)) <= CERTAIN:
             break
         for _ in range(max(1, np.count_nonzero(kept) // _REMOVED)):
             left = np.flatnonzero(kept)

@@ -12,7 +12,7 @@ from colmap_av1.poses.seams import Seams
 NONE = np.empty(0, np.int64)
 
 
-def rows(shortest: float, longest: float) -> dict[str, str]:
+def check(shortest: float, longest: float, expected_error: float | None = None) -> ModelCheck:
     figures = ModelFigures(
         num_registered=42,
         num_points=9000,
@@ -23,7 +23,19 @@ def rows(shortest: float, longest: float) -> dict[str, str]:
         focal_length=(shortest + longest) / 2,
         focal_lengths=(shortest, longest),
     )
-    return dict(model_rows(ModelCheck(figures, Seams((), NONE, NONE, NONE, NONE), None, None)))
+    return ModelCheck(figures, Seams((), NONE, NONE, NONE, NONE), expected_error, None, None)
+
+
+def rows(shortest: float, longest: float) -> dict[str, str]:
+    return dict(model_rows(check(shortest, longest)))
+
+
+def test_uncertain_positions_are_reported() -> None:
+    certain, uncertain = check(300, 300, 0.0002), check(300, 300, 0.0042)
+    assert "0.020%" in dict(model_rows(certain))["camera positions"]
+    assert certain.warnings == ()
+    (warning,) = uncertain.warnings
+    assert "0.4%" in warning
 
 
 def test_focal_lengths_are_printed_as_a_range() -> None:

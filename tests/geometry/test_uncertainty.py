@@ -18,16 +18,16 @@ from colmap_av1.geometry.colmap_model import (
     write_model,
 )
 from colmap_av1.geometry.posed_model import PosedModel, posed_model
-from colmap_av1.geometry.uncertainty import centre_uncertainty
+from colmap_av1.geometry.uncertainty import centre_uncertainty, expected_error
 
-NUM_IMAGES, NUM_POINTS = 10, 80
+NUM_IMAGES = 10
 SIGMA = 0.5
 
 
-def scene(rng: np.random.Generator, camera: pycolmap.Camera) -> PosedModel:
+def scene(rng: np.random.Generator, camera: pycolmap.Camera, num_points: int = 80) -> PosedModel:
     """A camera that moves to the side; six images see each point, with errors of `SIGMA`."""
-    xyz = rng.uniform([-3, -2, 6], [6, 2, 12], (NUM_POINTS, 3))
-    first = rng.integers(0, NUM_IMAGES - 5, NUM_POINTS)
+    xyz = rng.uniform([-3, -2, 6], [6, 2, 12], (num_points, 3))
+    first = rng.integers(0, NUM_IMAGES - 5, num_points)
     image = (first[:, None] + np.arange(6)).ravel()
     poses = np.tile(np.eye(3, 4), (NUM_IMAGES, 1, 1))
     along = np.arange(NUM_IMAGES)
@@ -36,9 +36,9 @@ def scene(rng: np.random.Generator, camera: pycolmap.Camera) -> PosedModel:
     xy = np.asarray(camera.img_from_cam(local)) + rng.normal(0, SIGMA, (len(image), 2))
     points = ModelPoints(
         xyz,
-        np.zeros((NUM_POINTS, 3), np.uint8),
-        np.zeros(NUM_POINTS),
-        np.arange(0, 6 * NUM_POINTS + 1, 6),
+        np.zeros((num_points, 3), np.uint8),
+        np.zeros(num_points),
+        np.arange(0, 6 * num_points + 1, 6),
         image,
         xy,
     )
@@ -71,6 +71,18 @@ def test_uncertainty_is_the_error_after_adjustment(name: str, tmp_path: Path) ->
     rms = np.sqrt(np.mean(np.square(actual)))
     # The adjustment also lowers the errors of the observations, by a few per cent.
     assert np.mean(expected) == pytest.approx(rms, rel=0.25)
+
+
+def test_error_is_estimated_from_some_of_the_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500, 640, 480)
+    made = scene(np.random.default_rng(2), camera, 1000)
+    whole = expected_error(made)
+    assert whole == pytest.approx(np.sqrt(np.mean(centre_uncertainty(made) ** 2)))
+    monkeypatch.setattr("colmap_av1.geometry.uncertainty._MAX_OBSERVATIONS", 3000)
+    some = expected_error(made)
+    assert some != whole
+    assert some == pytest.approx(whole, rel=0.3)
+    assert expected_error(replace(made, images=made.images[:1])) is None
 
 
 def test_image_with_too_few_points_is_uncertain() -> None:
