@@ -295,7 +295,7 @@ def test_truncated_stream_is_used_up_to_the_damage(
     assert refined.num_observations == report.num_observations
     # A few images are spread over the frames before the damage.
     few = MatchOptions(images=ImageOptions(num_images=4), verify=PAIRS)
-    spread = match(tmp_path / "c.db", cut, options=few)
+    spread = match(tmp_path / "c.db", cut, image_path=tmp_path / "few", options=few)
     names = [image.name for image in read_images(tmp_path / "c.db")]
     assert spread.num_images == 4
     assert names[-1] == f"frame_{report.num_frames - 1:06d}.png"

@@ -16,20 +16,26 @@ from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 # and those above by up to 23 %. Eight clips have 0.003 to 0.06 %.
 CERTAIN = 0.001
 # Models with more images are not examined, which would take long.
-_MAX_IMAGES = 500
+MAX_IMAGES = 500
 # The expected error of a model with more observations is estimated from some of its points.
 _MAX_OBSERVATIONS = 300_000
+# A similarity transform explains any error of two centres.
+_FEWEST_IMAGES = 3
 # Observations with a larger multiple of the median error are outliers.
 _OUTLIER = 4.0
 # Median of a Rayleigh distribution, that of the length of errors in two dimensions, in units of its
 # scale.
 _RAYLEIGH_MEDIAN = 1.1774
-# Added to the normal equations of points, as a share of their trace: points at infinity have no
-# depth.
-_DAMPING = 1e-9
+# Added to the normal equations of points, as a share of their largest eigenvalue: points at
+# infinity have no depth.
+_DAMPING = 1e-11
 # Smallest eigenvalue of the normal equations that is not due to rounding, as a share of the
 # largest.
-_LEAST_EIGENVALUE = 1e-14
+_LEAST_EIGENVALUE = 1e-12
+# Smallest singular value of the moves by a similarity transform, as a share of the largest.
+_ON_A_LINE = 1e-9
+# Added so that the equations of points without observations can be solved.
+_NO_OBSERVATION = 1e-30
 # A similarity transform of the whole model, which no observation determines, has so many degrees of
 # freedom.
 _GAUGE = 7
@@ -43,9 +49,10 @@ def expected_error(model: PosedModel) -> float | None:
 
     Returns:
         The root mean square over the images, as a share of the extent of the centres. None for
-        models of one image or of more than 500.
+        models of more than 500 images, and where it is not defined: with fewer than three images,
+        without points, or with all centres at one place.
     """
-    if not 2 <= len(model.images) <= _MAX_IMAGES:
+    if not _FEWEST_IMAGES <= len(model.images) <= MAX_IMAGES:
         return None
     points = model.points
     # The information of independent observations adds up.
@@ -53,7 +60,7 @@ def expected_error(model: PosedModel) -> float | None:
     some = np.arange(len(points.xyz)) % every == 0
     kept, _ = keep_observations(points, np.repeat(some, np.diff(points.offsets)))
     errors = centre_uncertainty(replace(model, points=kept)) / math.sqrt(every)
-    return float(np.sqrt(np.mean(errors**2)))
+    return float(np.sqrt(np.mean(errors**2))) if np.isfinite(errors).all() else None
 
 
 def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
@@ -65,27 +72,36 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
     are not independent: on rendered walks, the actual errors were 2 to 20 times the expected ones.
 
     Args:
-        model: a model of two images or more, with points.
+        model: a model of three images or more, with points.
 
     Returns:
         float64 [num_images] in units of the diagonal of the bounding box of all centres; very large
-        where observations do not determine a pose.
+        where observations do not determine a pose. Infinite if all centres are at one place, or no
+        point lies in front of an image.
     """
     from scipy.linalg import cholesky, solve_triangular  # noqa: PLC0415 - slow to import
     from scipy.sparse import block_diag, bsr_matrix  # noqa: PLC0415
 
     points, num_images = model.points, len(model.images)
+    centres = camera_centres(np.array([own.cam_from_world for own in model.images]))
+    extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
     errors = reprojection_errors(model)
-    median = float(np.median(errors)) if len(errors) else 0.0
+    if extent == 0 or not np.isfinite(errors).any():
+        return np.full(num_images, np.inf)
+    median = float(np.median(errors[np.isfinite(errors)]))
     kept = np.isfinite(errors) & (errors <= _OUTLIER * median)
     point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))[kept]
     image = points.image[kept].astype(np.int64)
+    # In units of the extent, and from the mean of the centres.
     rotation = np.array([own.cam_from_world[:, :3] for own in model.images])
-    translation = np.array([own.cam_from_world[:, 3] for own in model.images])
+    origin = centres.mean(axis=0)
+    centres = (centres - origin) / extent
+    xyz = (points.xyz - origin) / extent
+    translation = -np.einsum("nij,nj->ni", rotation, centres)
     focal = np.array([model.cameras[own.camera_id].mean_focal_length() for own in model.images])
 
     # An observation measures the direction of its ray, by two angles of one pixel per focal length.
-    ray = np.einsum("nij,nj->ni", rotation[image], points.xyz[point]) + translation[image]
+    ray = np.einsum("nij,nj->ni", rotation[image], xyz[point]) + translation[image]
     depth = np.linalg.norm(ray, axis=1)
     unit = ray / depth[:, None]
     across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
@@ -98,21 +114,18 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
     np.add.at(of_poses, image, by_pose.transpose(0, 2, 1) @ by_pose)
     of_points = np.zeros((len(points.xyz), 3, 3))
     np.add.at(of_points, point, by_point.transpose(0, 2, 1) @ by_point)
-    of_points += (_DAMPING * np.trace(of_points, axis1=1, axis2=2) + 1e-30)[:, None, None] * np.eye(
-        3
-    )
-    mixed = by_pose.transpose(0, 2, 1) @ by_point
+    # The inverse by eigenvectors stays accurate across the rays of points without depth.
+    sizes, axes = np.linalg.eigh(of_points)
+    damped = sizes + _DAMPING * sizes[:, -1:] + _NO_OBSERVATION
+    root_of_inverse = axes / np.sqrt(damped)[:, None, :]
+    mixed = by_pose.transpose(0, 2, 1) @ by_point @ root_of_inverse[point]
     order = np.lexsort([point, image])
     rows = np.searchsorted(image[order], np.arange(num_images + 1))
     shape = (6 * num_images, 3 * len(points.xyz))
-    one = bsr_matrix((mixed[order], point[order], rows), shape=shape)
-    eliminated = mixed @ np.linalg.inv(of_points)[point]
-    other = bsr_matrix((eliminated[order], point[order], rows), shape=shape)
-    normal = (block_diag(of_poses) - other @ one.T).toarray()
-    normal = (normal + normal.T) / 2
+    eliminated = bsr_matrix((mixed[order], point[order], rows), shape=shape)
+    normal = (block_diag(of_poses) - eliminated @ eliminated.T).toarray()
 
     # Errors of the centres, without those that a similarity transform of the whole model explains.
-    centres = camera_centres(np.array([own.cam_from_world for own in model.images]))
     gauge = _gauge(rotation, translation)
     largest = float(np.diag(normal).max())
     ridge = _LEAST_EIGENVALUE * largest * np.eye(len(normal))
@@ -125,8 +138,7 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
     moves -= similarity @ (similarity.T @ moves)
     deviations = solve_triangular(root, moves.T, lower=True)
     variance = (deviations**2).sum(axis=0).reshape(-1, 3).sum(axis=1)
-    extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
-    return np.asarray(median / _RAYLEIGH_MEDIAN / extent * np.sqrt(variance))
+    return np.asarray(median / _RAYLEIGH_MEDIAN * np.sqrt(variance))
 
 
 def _cross(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -148,10 +160,13 @@ def _gauge(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> N
 
 
 def _similarity_moves(centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Orthonormal basis [3 n, 7] of the moves of centres [n, 3] by similarity transforms."""
-    relative = centres - centres.mean(axis=0)
+    """Orthonormal basis [3 n, 7] of the moves of centres [n, 3] by similarity transforms.
+
+    The basis has one column less if the centres lie on a line: a rotation about it moves none.
+    """
     moves = np.zeros((len(centres), 3, _GAUGE))
     moves[:, :, :3] = np.eye(3)
-    moves[:, :, 3:6] = _cross(relative)
-    moves[:, :, 6] = relative
-    return np.asarray(np.linalg.qr(moves.reshape(-1, _GAUGE))[0])
+    moves[:, :, 3:6] = _cross(centres)
+    moves[:, :, 6] = centres
+    basis, sizes, _ = np.linalg.svd(moves.reshape(-1, _GAUGE), full_matrices=False)
+    return np.asarray(basis[:, sizes > _ON_A_LINE * sizes[0]])

@@ -223,6 +223,9 @@ def skip_blurred(
 
     Returns:
         int32 [len(frames)] frames, strictly ascending.
+
+    Raises:
+        ImageError: pictures cannot be decoded.
     """
     reach = np.floor(np.diff(frames) * _REACH).astype(np.int64)
     windows = {
@@ -233,7 +236,13 @@ def skip_blurred(
     if not windows:
         return frames
     asked = np.unique(np.concatenate(list(windows.values())))
-    measured = dict(zip(asked.tolist(), sharpness(asked.tolist()), strict=True))
+    values = sharpness(asked.tolist())
+    if len(values) < len(asked):
+        raise ImageError(
+            f"only {len(values)} of {len(asked)} pictures can be decoded to find blurred ones: "
+            "give --skip_blurred 0"
+        )
+    measured = dict(zip(asked.tolist(), values, strict=True))
     chosen = frames.copy()
     for k, window in windows.items():
         sharp = np.array([measured[int(f)] for f in window])

@@ -123,7 +123,7 @@ def prepare_images(
         listed: (width, height) of images in an existing database, by name.
         masks: masks of the pictures; None: all pixels are used.
         next_to: the output file, see `open_source`.
-        context: measures the stages up to "choice".
+        context: measures the choice of images and the stages of `track_video`.
 
     Raises:
         VideoError: the video cannot be read.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import VideoError
+from colmap_av1.errors import ImageError, VideoError
 from colmap_av1.images.choosing import ChosenImages, choose_images
 from colmap_av1.images.masks import VideoMasks
 from colmap_av1.options import ImageOptions, ReadOptions, TrackingOptions
@@ -135,21 +136,31 @@ def track_chosen_images(
             of_model=choice.of_model,
         )
 
-    if choice.needs_tracks:
-        return track(lambda tracked: choose(tracked.tracks.num_frames, tracked.tracks))
+    def choose_by_tracks(tracked: TrackedVideo) -> ChosenImages:
+        needed = tracked.tracks if choice.needs_tracks else None
+        return choose(tracked.tracks.num_frames, needed)
+
+    if every_frame or choice.needs_tracks or options.refine.refine != "none":
+        return track(choose_by_tracks)
+    # The headers of a damaged stream may promise more frames than can be read. The images are then
+    # chosen from the frames with tracks.
     num_frames = count_frames(source, options.read)
-    with context.clock.measure("choice"):
-        chosen = choose(num_frames)
+    try:
+        with context.clock.measure("choice"), warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            chosen = choose(num_frames)
+    except ImageError:
+        return track(choose_by_tracks)
+    for warning in caught:
+        warnings.warn(str(warning.message), stacklevel=2)
 
     def choose_again(tracked: TrackedVideo) -> ChosenImages:
-        """The images; chosen anew if damage, which headers do not show, leaves fewer frames."""
-        left = tracked.tracks.num_frames
-        return chosen if left >= num_frames else choose(left)
+        is_whole = tracked.tracks.num_frames >= num_frames
+        return chosen if is_whole else choose_by_tracks(tracked)
 
-    if every_frame or options.refine.refine != "none" or len(chosen.frames) == num_frames:
-        return track(choose_again)
-    found = track(choose_again, chosen.frames)
-    if np.isin(found.chosen.frames, chosen.frames).all():
+    frames = chosen.frames if len(chosen.frames) < num_frames else None
+    found = track(choose_again, frames)
+    if frames is None or np.isin(found.chosen.frames, frames).all():
         return found
     return track(lambda _: found.chosen, found.chosen.frames)
 
@@ -168,8 +179,8 @@ def track_images(
 ) -> TrackedImages:
     """Chain the motion of a video into tracks, mask them, choose images and refine tracks there.
 
-    Masks of frames are applied before images are chosen. All masks are applied again at the end,
-    since refinement moves observations and images may have their own masks.
+    Masks of frames are applied first. All masks are applied again at the end, since refinement
+    moves observations and images may have their own masks.
 
     Args:
         source: the video.
@@ -204,8 +215,9 @@ def track_images(
     if video.sampled_ends is not None:
         ends = _as_displayed(video.sampled_ends, source, display)
         if masks is not None:
-            ends = masks.on_frames(ends, min_length=1)
-        video = replace(video, sampled_ends=ends)
+            ends = masks.on_frames(ends, min_length=2)
+        # Of a track with one end in a masked or hidden place, it is not known how long it lasts.
+        video = replace(video, sampled_ends=ends.keep_long(2))
     if masks is not None:
         video = replace(
             video,

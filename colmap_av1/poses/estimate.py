@@ -277,8 +277,9 @@ def split_at_seams(
         image_set: the images.
         only_certain: also remove images whose positions are uncertain, see `certain_parts`.
 
-    Raises:
-        ModelError: too few images are certain.
+    Returns:
+        The poses of the largest part. If no part is certain, its stages are those before, and its
+        mapped model has no image.
     """
     for number in count(_FIRST_SPLIT):
         if posed.adjustment is None:
@@ -297,10 +298,13 @@ def split_at_seams(
             )
         is_whole = not seams or parts.result.num_registered == num_images
         if is_whole and only_certain:
+            seams = []
             parts = certain_stage(run, image_set, posed.mapped, posed.adjustment, number=number)
             is_whole = parts.result.num_registered == num_images
         if is_whole:
             break
+        if parts.result.num_registered == 0:
+            return replace(posed, mapped=parts)
         frame_of = image_set.images.frame_of
         frames = [frame_of[first] for first, _ in seams]
         posed = replace(

@@ -108,15 +108,16 @@ def further_poses(
             if map_again:
                 posed = remapped_poses(own, posed, some, least_kept=_LEAST_KEPT)
             posed = split_at_seams(own, posed, some, only_certain=True)
-            new = _registered(own, posed) & left
-        except ModelError:  # too few tracks agree with these poses, or the poses are uncertain
-            posed, new = None, set[str]()
+        except ModelError:  # too few tracks agree with these poses
+            posed = None
+        new = set[str]()
+        if posed is not None:
+            waiting += _other_models(own, posed)
+            if posed.mapped.result.num_registered > 0:  # its positions are certain
+                new = _registered(own, posed) & left
         if left_out is not None:
             left_out |= (known & left) - new
-        if posed is None:
-            continue
-        waiting += _other_models(own, posed)
-        if len(new) < FEWEST_IMAGES:
+        if posed is None or len(new) < FEWEST_IMAGES:
             continue
         number += 1
         yield FurtherPoses(own, posed, _named(image_set, left))

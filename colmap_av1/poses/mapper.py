@@ -68,8 +68,9 @@ def map_poses(
         num_images: number of images, for the progress.
         progress: called in the stage "poses" with the number of images registered so far.
         effort: how often and how exactly all images are adjusted. full: as by COLMAP's defaults;
-            video: as by its settings for videos; early: adjustment ends early, because the poses
-            are adjusted later.
+            video: by the incremental mapper, as often as in COLMAP's settings for videos, and only
+            as exactly as makes a difference; early: adjustment ends early, because the poses are
+            adjusted later.
 
     Returns:
         Number of registered images of each model, in descending order; empty if there is no model.
@@ -79,7 +80,7 @@ def map_poses(
     """
     output.mkdir(parents=True, exist_ok=True)
     settings = _mapping_settings(database, output, options, image_path)
-    if effort == "video":
+    if effort == "video" and options.mapper == "incremental":
         settings |= {"growth": _VIDEO_GROWTH, "tolerance": _VIDEO_TOLERANCE}
     elif effort == "early":
         settings["tolerance"] = _EARLY_TOLERANCE

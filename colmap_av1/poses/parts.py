@@ -25,10 +25,9 @@ from typing import Any
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import camera_centres, keep_observations
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
-from colmap_av1.geometry.uncertainty import CERTAIN, centre_uncertainty
+from colmap_av1.geometry.uncertainty import CERTAIN, MAX_IMAGES, centre_uncertainty
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.mapping_stage import MappedResult
@@ -97,17 +96,11 @@ def certain_stage(
 ) -> Kept[MappedResult]:
     """Keep the images of an adjusted model whose positions are certain, see `certain_parts`.
 
-    Arguments and result are those of `split_stage`.
-
-    Raises:
-        ModelError: too few images are certain.
+    Arguments and result are those of `split_stage`. No image is registered if too few are certain.
     """
 
     def parts(known: PosedModel) -> list[AbstractSet[str]]:
-        found = certain_parts(known, image_set)
-        if not found:
-            raise ModelError("few points determine the positions of the cameras")
-        return found
+        return certain_parts(known, image_set)
 
     return _parts_stage(run, image_set, mapped, adjusted, parts, name=f"certain_{number}")
 
@@ -167,20 +160,20 @@ def certain_parts(model: PosedModel, image_set: ImageSet) -> list[AbstractSet[st
     """The names of the images of a model whose positions are certain.
 
     Images at either end of a video are removed, the most uncertain first, until the expected error
-    of the camera centres is small.
+    of the camera centres is small. Models of many images, which take long, are not examined.
 
     Args:
         model: the model with its points.
         image_set: all images.
 
     Returns:
-        The certain images, and stretches of ten images or more that were removed, which may be
-        certain without these. Empty if fewer than ten images are certain.
+        First the certain images, none if they are fewer than ten. Then stretches of ten images or
+        more that were removed, which may be certain without the others.
     """
     is_posed = np.isin(image_set.images.names, [image.name for image in model.images])
     names, videos = np.array(image_set.images.names)[is_posed], image_set.sequence[is_posed]
     kept = np.ones(len(names), np.bool_)
-    while np.count_nonzero(kept) >= FEWEST_IMAGES:
+    while FEWEST_IMAGES <= np.count_nonzero(kept) <= MAX_IMAGES:
         part = _with_images(model, set(names[kept].tolist()))
         error_of = dict(zip(part.by_name, centre_uncertainty(part).tolist(), strict=True))
         errors = np.array([error_of.get(name, 0.0) for name in names.tolist()])
@@ -191,11 +184,10 @@ def certain_parts(model: PosedModel, image_set: ImageSet) -> list[AbstractSet[st
             is_end = np.diff(videos[left], prepend=-1, append=-1) != 0
             ends = left[is_end[:-1] | is_end[1:]]
             kept[ends[errors[ends].argmax()]] = False
-    else:
-        return []
+    certain = set(names[kept].tolist()) if np.count_nonzero(kept) >= FEWEST_IMAGES else set[str]()
     stretch = np.cumsum((np.diff(kept, prepend=True) != 0) | (np.diff(videos, prepend=-1) != 0))
     removed = [set(names[~kept & (stretch == k)].tolist()) for k in np.unique(stretch[~kept])]
-    return [set(names[kept].tolist()), *(own for own in removed if len(own) >= FEWEST_IMAGES)]
+    return [certain, *(own for own in removed if len(own) >= FEWEST_IMAGES)]
 
 
 def _with_images(model: PosedModel, names: AbstractSet[str]) -> PosedModel:

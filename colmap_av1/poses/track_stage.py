@@ -114,11 +114,11 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
     )
     tracking = replace(options.tracking, tracks=chaining)
     name, shown = stage_of_video(run, video), source.pictures
-    count = count_frames(source, options.read)
+    count = 0 if options.images.ways else count_frames(source, options.read)
     is_long = count > run.options.max_images
 
     def make(partial: Path) -> TracksResult:
-        if is_long and not options.images.ways:
+        if is_long:
             found = _track_long(run, video, tracking, count)
         else:
             found = track_chosen_images(
@@ -126,7 +126,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
                 tracking,
                 ImageChoice(options.images, folder=partial),
                 masks=run.inputs.masks_of_videos[video],
-                every_frame=not is_long or _has_shutter(run),
+                every_frame=True,
                 context=run.context,
             )
         chosen, tracked = found.chosen, found.video
@@ -190,7 +190,8 @@ def _track_long(run: Run, video: int, options: TrackingOptions, count: int) -> T
     candidates = np.array(evenly_spread(count, _CANDIDATES * run.options.max_images), np.int32)
     width, height = source.stream.picture_size
     held = len(candidates) * width * height / _PIXELS_PER_OBSERVATION
-    has_shutter = _has_shutter(run)
+    # Correcting the rolling shutter needs the motion between all neighbouring frames.
+    has_shutter = run.options.match.camera.rolling_shutter != "none"
     track = functools.partial(track_images, source, masks=run.inputs.masks_of_videos[video])
 
     if options.refine.refine == "none" and not has_shutter and held <= _MAX_HELD:
@@ -217,11 +218,6 @@ def _track_long(run: Run, video: int, options: TrackingOptions, count: int) -> T
         frames=None if has_shutter else chosen.frames,
         context=run.context,
     )
-
-
-def _has_shutter(run: Run) -> bool:
-    """Whether the rolling shutter is corrected, which needs the motion between all frames."""
-    return run.options.match.camera.rolling_shutter != "none"
 
 
 def _spread_in(run: Run, tracked: TrackedVideo, candidates: NDArray[np.int32]) -> ChosenImages:

@@ -17,7 +17,7 @@ _MOVED = 4.0
 _NUM_STEPS = 1000
 
 
-def remove_overlays(tracks: Tracks) -> Tracks:
+def remove_overlays(tracks: Tracks, moving: Tracks | None = None) -> Tracks:
     """Remove the tracks that stand still while the picture moves.
 
     The motion of the picture from frame to frame is the median step of its tracks, or of a sample
@@ -25,6 +25,9 @@ def remove_overlays(tracks: Tracks) -> Tracks:
 
     Args:
         tracks: any tracks.
+        moving: tracks of the same video that show the motion of the picture. Where tracks are
+            observed in distant frames only, most of those that remain may be overlays. None: the
+            tracks themselves.
 
     Returns:
         The other tracks in the same order; the same object if no track is removed.
@@ -32,7 +35,8 @@ def remove_overlays(tracks: Tracks) -> Tracks:
     if tracks.num_tracks == 0:
         return tracks
     first, last = tracks.offsets[:-1], tracks.offsets[1:] - 1
-    travelled = np.concatenate([[0.0], np.cumsum(_picture_motion(tracks))])
+    moving = tracks if moving is None or moving.num_tracks == 0 else moving
+    travelled = np.concatenate([[0.0], np.cumsum(_picture_motion(moving))])
     moved = travelled[tracks.frame[last] + 1] - travelled[tracks.frame[first] + 1]
     # Only tracks that end where they began can have stood still, and they are few.
     ends_still = _length(tracks.xy[last] - tracks.xy[first]) <= _STILL

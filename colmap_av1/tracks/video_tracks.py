@@ -87,7 +87,7 @@ class TrackedVideo:
     """The tracks of a video, and facts found while building them.
 
     Attributes:
-        tracks: tracks through all shown frames.
+        tracks: tracks through the shown frames, observed in all of them or in some only.
         num_coded_frames: number of frames with block data, including hidden ones.
         inter_share: float32 [num_frames] share of inter units in each frame that players show; the
             smallest share among the frame and the hidden frames before it.
@@ -265,7 +265,8 @@ def track_video(
             if stored is not None:  # the first showing of a frame may not be among the frames
                 tracks = tracks.keep_frames(stored[stored < tracks.num_frames])
             num_frames, num_tracks = tracks.num_frames, tracks.num_tracks
-            tracks, ends = remove_overlays(tracks), remove_overlays(ends)
+            tracks = remove_overlays(tracks, ends if coded is not None else None)
+            ends = remove_overlays(ends)
             overlay_share = (num_tracks - tracks.num_tracks) / max(num_tracks, 1)
             num_pixels = num_frames * width * height
             tracks, ends = _as_shown(tracks, source), _as_shown(ends, source)

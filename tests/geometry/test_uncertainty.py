@@ -14,6 +14,7 @@ from colmap_av1.geometry.colmap_model import (
     ModelImage,
     ModelPoints,
     keep_observations,
+    no_points,
     read_model,
     write_model,
 )
@@ -82,7 +83,31 @@ def test_error_is_estimated_from_some_of_the_points(monkeypatch: pytest.MonkeyPa
     some = expected_error(made)
     assert some != whole
     assert some == pytest.approx(whole, rel=0.3)
-    assert expected_error(replace(made, images=made.images[:1])) is None
+
+
+def test_parts_without_common_points_are_uncertain() -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500, 640, 480)
+    made = scene(np.random.default_rng(3), camera, 4000)
+    first = np.minimum.reduceat(made.points.image, made.points.offsets[:-1])
+    half = NUM_IMAGES // 2
+    own = np.repeat(first, 6) == first[0]
+    is_before = made.points.image < half
+    kept = (is_before & np.repeat(first < 2, 6)) | (~is_before & np.repeat(first >= 3, 6))
+    assert not kept[own & ~is_before].any() or not kept[own & is_before].any()
+    points, _ = keep_observations(made.points, kept)
+    assert expected_error(made) < 0.001
+    assert expected_error(replace(made, points=points)) > 0.1
+
+
+def test_error_is_unknown_where_it_is_not_defined() -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500, 640, 480)
+    made = scene(np.random.default_rng(4), camera)
+    assert expected_error(replace(made, points=no_points())) is None
+    assert expected_error(replace(made, images=made.images[:2], points=no_points())) is None
+    behind = replace(made.points, xyz=made.points.xyz * [1, 1, -1])
+    assert expected_error(replace(made, points=behind)) is None
+    turning = [replace(image, cam_from_world=np.eye(3, 4)) for image in made.images]
+    assert expected_error(replace(made, images=turning)) is None
 
 
 def test_image_with_too_few_points_is_uncertain() -> None:

@@ -51,10 +51,6 @@ def tracks_from(paths: np.ndarray, size: tuple[int, int] = (640, 480)) -> Tracks
     )
 
 
-def still(num_frames: int) -> Tracks:
-    return tracks_from(np.full((3, num_frames, 2), 100.0))
-
-
 def project(centres: np.ndarray, angles: np.ndarray) -> Tracks:
     """Tracks of points at depths 4 to 20, for cameras at x = centre, rotated about y."""
     rng = np.random.default_rng(0)

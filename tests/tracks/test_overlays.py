@@ -71,6 +71,17 @@ def test_motion_is_measured_between_kept_frames() -> None:
     np.testing.assert_array_equal(kept.xy, some.xy[5:])
 
 
+def test_short_tracks_show_that_the_picture_moves() -> None:
+    """In distant frames, only the overlay is observed twice."""
+    still = [(0, np.full((101, 2), 50.0))] * 3
+    tracks = make_tracks([*still, *[(start, moving(2.0, 10)) for start in range(91)]], 101)
+    some = tracks.keep_frames(np.arange(0, 101, 25, dtype=np.int32)).keep_long(2)
+    is_end = np.zeros(tracks.num_observations, np.bool_)
+    is_end[tracks.offsets[:-1]] = is_end[tracks.offsets[1:] - 1] = True
+    assert some.num_tracks == 3
+    assert remove_overlays(some, tracks.keep_observations(is_end)).num_tracks == 0
+
+
 def test_no_tracks_remain_no_tracks() -> None:
     none = remove_overlays(Tracks.empty(5, (640, 480)))
     assert none.offsets.tolist() == [0]

@@ -19,6 +19,7 @@ TrackBuilder::TrackBuilder(const TrackBuilderOptions& options)
       size > 2 * options.cells) {
     throw std::invalid_argument("cells are 1, 2 or 4, seeding one of these, to twice as many");
   }
+  if (options.ends_of < 0) throw std::invalid_argument("ends_of is negative");
 }
 
 void TrackBuilder::add(const FrameMotion& coded) {
