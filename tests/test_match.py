@@ -293,13 +293,25 @@ def test_truncated_stream_is_used_up_to_the_damage(
     refined = match(tmp_path / "b.db", cut, options=LK)
     assert refined.num_frames == report.num_frames
     assert refined.num_observations == report.num_observations
-    # A few images are spread over the frames before the damage.
+
+
+def test_images_are_spread_over_the_frames_before_the_damage(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """The headers do not show that the data of a frame are damaged."""
+    data = bytearray(ffmpeg("-i", clip, "-c", "copy", tmp_path / "whole.ivf").read_bytes())
+    hurt = tmp_path / "hurt.ivf"
+    damaged = slice(int(0.85 * len(data)), int(0.9 * len(data)))
+    data[damaged] = np.random.default_rng(0).bytes(damaged.stop - damaged.start)
+    hurt.write_bytes(data)
     few = MatchOptions(images=ImageOptions(num_images=4), verify=PAIRS)
-    spread = match(tmp_path / "c.db", cut, image_path=tmp_path / "few", options=few)
-    names = [image.name for image in read_images(tmp_path / "c.db")]
-    assert spread.num_images == 4
+    report = match(tmp_path / "a.db", hurt, image_path=tmp_path / "few", options=few)
+    names = [image.name for image in read_images(tmp_path / "a.db")]
+    assert 4 < report.num_frames < 16
+    assert len(names) == len(list((tmp_path / "few").iterdir())) == 4
     assert names[-1] == f"frame_{report.num_frames - 1:06d}.png"
-    assert spread.num_inliers > 0
+    assert report.num_inliers > 0
+    assert len(report.warnings) == 1
 
 
 def test_database_is_written_although_the_mapper_crashes(
