@@ -22,7 +22,7 @@ from colmap_av1.errors import DatabaseError, ImageError, ModelError, OptionError
 from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.geometry.posed_model import posed_model
-from colmap_av1.geometry.uncertainty import CERTAIN, expected_error
+from colmap_av1.geometry.uncertainty import MAX_CERTAIN_ERROR, expected_error
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
 from colmap_av1.matching.few_matches import few_matches_warning
@@ -254,7 +254,7 @@ def _uncertain_models(output: Path, num_models: int) -> list[str]:
     uncertain = []
     for number in range(1, num_models):
         error = expected_error(posed_model(read_model(output / str(number)), with_points=True))
-        if error is not None and error > CERTAIN:
+        if error is not None and error > MAX_CERTAIN_ERROR:
             uncertain.append(f"'{number}'")
     if not uncertain:
         return []

@@ -14,14 +14,14 @@ from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 # Largest expected error of the camera centres of a model that is certain, as a share of their
 # extent. Of 51 models of rendered walks, those below it were off by at most 0.26 % of their extent,
 # and those above by up to 23 %. Eight clips have 0.003 to 0.06 %.
-CERTAIN = 0.001
-# Models with more images are not examined, which would take long.
+MAX_CERTAIN_ERROR = 0.001
+# Models with more images are not examined, because that would take long.
 MAX_IMAGES = 500
 # The expected error of a model with more observations is estimated from some of its points.
 _MAX_OBSERVATIONS = 300_000
 # A similarity transform explains any error of two centres.
 _FEWEST_IMAGES = 3
-# Observations with a larger multiple of the median error are outliers.
+# Observations whose error exceeds this multiple of the median error are outliers.
 _OUTLIER = 4.0
 # Median of a Rayleigh distribution, that of the length of errors in two dimensions, in units of its
 # scale.
@@ -38,7 +38,7 @@ _ON_A_LINE = 1e-9
 _NO_OBSERVATION = 1e-30
 # A similarity transform of the whole model, which no observation determines, has so many degrees of
 # freedom.
-_GAUGE = 7
+_GAUGE_FREEDOMS = 7
 
 
 def expected_error(model: PosedModel) -> float | None:
@@ -54,12 +54,7 @@ def expected_error(model: PosedModel) -> float | None:
     """
     if not _FEWEST_IMAGES <= len(model.images) <= MAX_IMAGES:
         return None
-    points = model.points
-    # The information of independent observations adds up.
-    every = max(1, math.ceil(len(points.image) / _MAX_OBSERVATIONS))
-    some = np.arange(len(points.xyz)) % every == 0
-    kept, _ = keep_observations(points, np.repeat(some, np.diff(points.offsets)))
-    errors = centre_uncertainty(replace(model, points=kept)) / math.sqrt(every)
+    errors = centre_uncertainty(model)
     return float(np.sqrt(np.mean(errors**2))) if np.isfinite(errors).all() else None
 
 
@@ -68,8 +63,9 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
 
     They are the standard deviations of bundle adjustment of poses and points (Triggs et al., Bundle
     Adjustment - A Modern Synthesis, 2000), after similarity alignment of the centres. Errors of
-    observations are assumed to be independent and as large as those of the model. Errors of tracks
-    are not independent: on rendered walks, the actual errors were 2 to 20 times the expected ones.
+    observations are assumed to be independent and as large as the model's reprojection errors. In
+    tracks they are not independent: on rendered walks, actual errors were 2 to 20 times the
+    expected ones.
 
     Args:
         model: a model of three images or more, with points.
@@ -77,8 +73,15 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
     Returns:
         float64 [num_images] in units of the diagonal of the bounding box of all centres; very large
         where observations do not determine a pose. Infinite if all centres are at one place, or no
-        point lies in front of an image.
+        observed point lies in front of its camera.
     """
+    every = math.ceil(len(model.points.image) / _MAX_OBSERVATIONS)
+    if every > 1:  # the information of independent observations adds up
+        some = np.arange(len(model.points.xyz)) % every == 0
+        kept = np.repeat(some, np.diff(model.points.offsets))
+        points, _ = keep_observations(model.points, kept)
+        return centre_uncertainty(replace(model, points=points)) / math.sqrt(every)
+
     from scipy.linalg import cholesky, solve_triangular  # noqa: PLC0415 - slow to import
     from scipy.sparse import block_diag, bsr_matrix  # noqa: PLC0415
 
@@ -100,7 +103,8 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
     translation = -np.einsum("nij,nj->ni", rotation, centres)
     focal = np.array([model.cameras[own.camera_id].mean_focal_length() for own in model.images])
 
-    # An observation measures the direction of its ray, by two angles of one pixel per focal length.
+    # An observation measures the direction of its ray by two angles. An error of one pixel is an
+    # error of 1 / focal length.
     ray = np.einsum("nij,nj->ni", rotation[image], xyz[point]) + translation[image]
     depth = np.linalg.norm(ray, axis=1)
     unit = ray / depth[:, None]
@@ -109,7 +113,7 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
     by_pose = np.concatenate([-by_ray @ _cross(ray), by_ray], axis=2)
     by_point = by_ray @ rotation[image]
 
-    # Normal equations, from which the points are eliminated.
+    # The reduced camera matrix: the Schur complement of the points in the normal equations.
     of_poses = np.zeros((num_images, 6, 6))
     np.add.at(of_poses, image, by_pose.transpose(0, 2, 1) @ by_pose)
     of_points = np.zeros((len(points.xyz), 3, 3))
@@ -123,13 +127,13 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
     rows = np.searchsorted(image[order], np.arange(num_images + 1))
     shape = (6 * num_images, 3 * len(points.xyz))
     eliminated = bsr_matrix((mixed[order], point[order], rows), shape=shape)
-    normal = (block_diag(of_poses) - eliminated @ eliminated.T).toarray()
+    reduced = (block_diag(of_poses) - eliminated @ eliminated.T).toarray()
 
     # Errors of the centres, without those that a similarity transform of the whole model explains.
     gauge = _gauge(rotation, translation)
-    largest = float(np.diag(normal).max())
-    ridge = _LEAST_EIGENVALUE * largest * np.eye(len(normal))
-    root = cholesky(normal + ridge + largest * gauge @ gauge.T, lower=True)
+    largest = float(np.diag(reduced).max())
+    ridge = _LEAST_EIGENVALUE * largest * np.eye(len(reduced))
+    root = cholesky(reduced + ridge + largest * gauge @ gauge.T, lower=True)
     by_translation = np.zeros((num_images, 3, num_images, 6))
     each = np.arange(num_images)
     by_translation[each, :, each, 3:] = -rotation.transpose(0, 2, 1)
@@ -151,12 +155,12 @@ def _cross(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _gauge(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Orthonormal basis [6 n, 7] of the pose changes that follow a similarity transform."""
-    changes = np.zeros((len(rotation), 6, _GAUGE))
+    changes = np.zeros((len(rotation), 6, _GAUGE_FREEDOMS))
     changes[:, 3:, :3] = rotation
     changes[:, :3, 3:6] = rotation
     changes[:, 3:, 3:6] = _cross(translation) @ rotation
     changes[:, 3:, 6] = translation
-    return np.asarray(np.linalg.qr(changes.reshape(-1, _GAUGE))[0])
+    return np.asarray(np.linalg.qr(changes.reshape(-1, _GAUGE_FREEDOMS))[0])
 
 
 def _similarity_moves(centres: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -164,9 +168,9 @@ def _similarity_moves(centres: NDArray[np.float64]) -> NDArray[np.float64]:
 
     The basis has one column less if the centres lie on a line: a rotation about it moves none.
     """
-    moves = np.zeros((len(centres), 3, _GAUGE))
+    moves = np.zeros((len(centres), 3, _GAUGE_FREEDOMS))
     moves[:, :, :3] = np.eye(3)
     moves[:, :, 3:6] = _cross(centres)
     moves[:, :, 6] = centres
-    basis, sizes, _ = np.linalg.svd(moves.reshape(-1, _GAUGE), full_matrices=False)
+    basis, sizes, _ = np.linalg.svd(moves.reshape(-1, _GAUGE_FREEDOMS), full_matrices=False)
     return np.asarray(basis[:, sizes > _ON_A_LINE * sizes[0]])

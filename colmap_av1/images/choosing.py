@@ -351,8 +351,12 @@ def _find_existing(
             chosen = chosen.some(np.flatnonzero(np.isin(chosen.names, names)))
         odd = sorted(set(names) ^ set(chosen.names))
         if odd:
-            where = "has no image" if odd[0] in chosen.names else f"{options.frame_list} has no"
-            raise ImageError(f"{where} '{odd[0]}': list exactly the images that exist")
+            lists = "lists" if odd[0] in chosen.names else "does not list"
+            exists = "does not exist" if odd[0] in chosen.names else "exists"
+            raise ImageError(
+                f"{options.frame_list} {lists} '{odd[0]}', which {exists}: list exactly the images "
+                "that exist"
+            )
     elif options.every is not None:
         chosen = _in_order(by_name, _at_steps(by_name, num_frames, options))
     else:
@@ -442,7 +446,7 @@ def _sharpness(pictures: Iterable[tuple[int, _Image]]) -> NDArray[np.float64]:
 
 
 def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:
-    """The frames that FFmpeg's fps filter selects: the last ones that round to a tick or below."""
+    """The frames that FFmpeg's fps filter selects: for each tick, the last that rounds to it."""
     tick = np.floor(times * fps + 0.5)
     interval = np.median(np.diff(times)) if len(times) > 1 else 0.0
     num_ticks = max(1.0, np.floor((times[-1] + interval) * fps + 0.5))

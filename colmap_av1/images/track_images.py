@@ -151,17 +151,19 @@ def track_chosen_images(
             chosen = choose(num_frames)
     except ImageError:
         return track(choose_by_tracks)
-    for warning in caught:
-        warnings.warn(str(warning.message), stacklevel=2)
 
     def choose_again(tracked: TrackedVideo) -> ChosenImages:
-        is_whole = tracked.tracks.num_frames >= num_frames
-        return chosen if is_whole else choose_by_tracks(tracked)
+        if tracked.tracks.num_frames < num_frames:
+            return choose_by_tracks(tracked)
+        for warning in caught:
+            warnings.warn(str(warning.message), stacklevel=2)
+        return chosen
 
     frames = chosen.frames if len(chosen.frames) < num_frames else None
     found = track(choose_again, frames)
     if frames is None or np.isin(found.chosen.frames, frames).all():
         return found
+    # The new choice has frames whose observations were not kept.
     return track(lambda _: found.chosen, found.chosen.frames)
 
 

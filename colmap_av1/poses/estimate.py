@@ -278,8 +278,8 @@ def split_at_seams(
         only_certain: also remove images whose positions are uncertain, see `certain_parts`.
 
     Returns:
-        The poses of the largest part. If no part is certain, its stages are those before, and its
-        mapped model has no image.
+        The poses of the largest part. If too few images are certain, its mapped model has no
+        images, and the poses of the other stages must not be used.
     """
     for number in count(_FIRST_SPLIT):
         if posed.adjustment is None:

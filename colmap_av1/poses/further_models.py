@@ -77,8 +77,8 @@ def further_poses(
         read_tracks: reads the tracks of each video. They are large, so they are not kept between
             the models.
         map_again: map the models again from their observations, see `remapping`.
-        left_out: gets the names of the images that the mapper registered, but whose poses are
-            uncertain or have too few tracks.
+        left_out: gets the names of the images of models that are not used: too few tracks agree
+            with their poses, their positions are uncertain, or they have too few images.
     """
     first_model = read_posed_model(run.stages / first.last.result.poses)
     left = set(image_set.images.names) - first_model.by_name.keys()
@@ -93,7 +93,7 @@ def further_poses(
         own_poses = _poses_of_model(own, first, mapped, first_model.cameras)
         if keeps_intrinsics(mapped.model, first_model):
             own = _with_known_intrinsics(own)
-        free = left.difference(*(other.model.by_name for other in waiting))
+        free = left.difference(mapped.excluded, *(other.model.by_name for other in waiting))
         some = _named(image_set, known | free)
         try:
             posed = refined_poses(
@@ -110,18 +110,22 @@ def further_poses(
             posed = split_at_seams(own, posed, some, only_certain=True)
         except ModelError:  # too few tracks agree with these poses
             posed = None
-        new = set[str]()
+        used = set[str]()
         if posed is not None:
-            waiting += _other_models(own, posed)
-            if posed.mapped.result.num_registered > 0:  # its positions are certain
-                new = _registered(own, posed) & left
+            registered = _registered(own, posed)
+            is_certain = posed.mapped.result.num_registered > 0
+            if is_certain and len(registered & left) >= FEWEST_IMAGES:
+                used = registered & left
+            # If a model is not used, its parts must not grow into it again.
+            excluded = frozenset() if used else mapped.excluded | registered | known
+            waiting += _other_models(own, posed, excluded)
         if left_out is not None:
-            left_out |= (known & left) - new
-        if posed is None or len(new) < FEWEST_IMAGES:
+            left_out |= (known & left) - used
+        if posed is None or not used:
             continue
         number += 1
         yield FurtherPoses(own, posed, _named(image_set, left))
-        left -= new
+        left -= used
     _remove_further_models(run, number)
 
 
@@ -133,17 +137,22 @@ class _MappedModel:
         digest: digest of the stage that made it.
         file: its file among the products of that stage.
         model: its poses.
+        excluded: names of other images that it must not get.
     """
 
     digest: str
     file: str
     model: PosedModel
+    excluded: frozenset[str] = frozenset()
 
 
-def _other_models(run: Run, posed: Posed) -> list[_MappedModel]:
+def _other_models(
+    run: Run, posed: Posed, excluded: frozenset[str] = frozenset()
+) -> list[_MappedModel]:
+    models = {f: read_posed_model(run.stages / f) for f in posed.mapped.result.other_models}
     return [
-        _MappedModel(posed.mapped.digest, file, read_posed_model(run.stages / file))
-        for file in posed.mapped.result.other_models
+        _MappedModel(posed.mapped.digest, file, model, excluded.difference(model.by_name))
+        for file, model in models.items()
     ]
 
 

@@ -28,9 +28,9 @@ ADJUSTMENT_TOLERANCE = 1e-4
 # Function tolerance of the mapper's global bundle adjustment where another adjustment follows. The
 # poses are the same after it, in half the time.
 _EARLY_TOLERANCE = 1e-4
-# COLMAP adjusts all images of a video whenever the number of images or points has grown by this
-# factor, instead of 1.1 (OptionManager::ModifyForVideoData). With this and a tolerance of 1e-6
-# instead of 0, the mapper takes two thirds of the time, and models are the same.
+# COLMAP's settings for videos adjust all images whenever the number of images or points has grown
+# by this factor, instead of 1.1 (OptionManager::ModifyForVideoData). With this and a tolerance of
+# 1e-6 instead of 0, the mapper takes two thirds of the time, and models are the same.
 _VIDEO_GROWTH = 1.4
 _VIDEO_TOLERANCE = 1e-6
 MapperEffort = Literal["full", "video", "early"]

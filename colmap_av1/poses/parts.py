@@ -1,4 +1,4 @@
-"""Split models at seams that hardly any points connect, and where positions are uncertain.
+"""Split models at seams that hardly any points connect, and remove images with uncertain poses.
 
 If hardly any points connect the two sides of a seam, bundle adjustment leaves their relative pose
 undetermined; if no points carry the scale across, it leaves their relative scale undetermined.
@@ -10,8 +10,8 @@ With wrong poses, points may seem to have parallax: while a camera turns, a moti
 much like a rotation. If the images were mapped twice, and the second result fits the observations
 hardly better than the first, the places must have parallax in both.
 
-In a small model, few points may connect all images. It keeps the images whose positions its points
-determine.
+Models other than the first also lose images at the ends of their videos, until the positions of the
+others are certain.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import camera_centres, keep_observations
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
-from colmap_av1.geometry.uncertainty import CERTAIN, MAX_IMAGES, centre_uncertainty
+from colmap_av1.geometry.uncertainty import MAX_CERTAIN_ERROR, MAX_IMAGES, centre_uncertainty
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.mapping_stage import MappedResult
@@ -96,7 +96,7 @@ def certain_stage(
 ) -> Kept[MappedResult]:
     """Keep the images of an adjusted model whose positions are certain, see `certain_parts`.
 
-    Arguments and result are those of `split_stage`. No image is registered if too few are certain.
+    Arguments and result are as for `split_stage`. No image is registered if too few are certain.
     """
 
     def parts(known: PosedModel) -> list[AbstractSet[str]]:
@@ -177,7 +177,7 @@ def certain_parts(model: PosedModel, image_set: ImageSet) -> list[AbstractSet[st
         part = _with_images(model, set(names[kept].tolist()))
         error_of = dict(zip(part.by_name, centre_uncertainty(part).tolist(), strict=True))
         errors = np.array([error_of.get(name, 0.0) for name in names.tolist()])
-        if np.sqrt(np.mean(errors[kept] ** 2)) <= CERTAIN:
+        if np.sqrt(np.mean(errors[kept] ** 2)) <= MAX_CERTAIN_ERROR:
             break
         for _ in range(max(1, np.count_nonzero(kept) // _REMOVED)):
             left = np.flatnonzero(kept)

@@ -45,8 +45,8 @@ _Image = NDArray[np.uint8]
 
 # Overlay tracks are reported if they are at least this share of all tracks.
 _NOTABLE_SHARE = 0.01
-# If observations are kept in some frames only, the ends are kept of so many tracks that a frame has
-# about this many of them.
+# Approximate number of tracks in each frame whose ends are sampled if observations are kept in some
+# frames only, and the number of pixels of a unit of motion, which has at most one track.
 _ENDS_PER_FRAME = 2000
 _PIXELS_PER_TRACK = 16
 
@@ -107,7 +107,7 @@ class TrackedVideo:
 
     @property
     def ends(self) -> Tracks:
-        """Tracks, or a sample of them, that begin and end in the frames in which they do so."""
+        """The tracks, or a sample of them, with their first and last observations in any frame."""
         return self.tracks if self.sampled_ends is None else self.sampled_ends
 
 
@@ -256,9 +256,9 @@ def track_video(
             if stored is not None:
                 coded = np.unique(first[stored[stored < len(first)]])
             width, height = source.stream.picture_size
-            of = max(1, width * height // (_PIXELS_PER_TRACK * _ENDS_PER_FRAME))
+            one_in = max(1, width * height // (_PIXELS_PER_TRACK * _ENDS_PER_FRAME))
             tracks, ends = build_tracks_and_ends(
-                motion, options.tracks, count, frames=coded, ends_of=0 if coded is None else of
+                motion, options.tracks, count, frames=coded, ends_of=0 if coded is None else one_in
             )
             first = first[: count_with_repeats(first, tracks.num_frames)]
             tracks, ends = tracks.with_repeats(first), ends.with_repeats(first)

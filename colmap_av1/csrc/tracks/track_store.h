@@ -56,10 +56,11 @@ class TrackStore {
   // Releases a frame. A track that no frame holds any more ends.
   void release(ChainedFrame& frame);
 
-  // Returns the kept tracks in the order of their seeds. No frame may hold a track any more.
+  // Returns the kept tracks in the order of their seeds. No frame may hold a track any more, and only
+  // `finish_ends` may be called afterwards.
   TrackArrays finish();
   // The ends of some of the long enough tracks, in the same order: one observation if they are the
-  // same, else two. The store cannot be used afterwards.
+  // same, else two.
   TrackArrays finish_ends();
 
  private:
@@ -105,7 +106,8 @@ class TrackStore {
   bool is_observed(const ChainedFrame& frame) const;
   bool has_ends(std::int32_t index) const {
     if (ends_of_ == 0) return false;
-    // Fibonacci hashing. The serial numbers themselves are those of a regular grid of seeds.
+    // Fibonacci hashing: a modulus of the serial numbers, which count cells, would choose whole
+    // columns of the grid of seeds.
     const auto hash = static_cast<std::uint64_t>(serials_[index]) * 0x9E3779B97F4A7C15U >> 32U;
     return hash % static_cast<std::uint64_t>(ends_of_) == 0;
   }
