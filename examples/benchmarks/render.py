@@ -320,7 +320,7 @@ def summary(rows: list[Row], *clips: str) -> str:
         def cell(line: Row) -> str:
             figures = [
                 number(whole[line["clip"], way], name, spelling)
-                for way in (SIFT_FROM_FILE, MATCH_PYCOLMAP, FROM_FILE)
+                for way in (SIFT_FROM_FILE, MATCH_MAP, FROM_FILE)
             ]
             return " / ".join(figures) if whole[line["clip"], FROM_FILE][name] else "-"
 
