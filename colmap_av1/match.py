@@ -561,11 +561,9 @@ def _match_jointly(
     stages.mkdir()
     # The images are already chosen, and their names need not suit trainers. Tracks are long enough
     # in all frames, of which only the images may be left.
-    tracks = replace(options.tracks, min_length=MIN_IMAGES)
-    is_limited = any(own.tracked.video.sampled_ends is not None for own in images.videos)
-    chosen = replace(
-        options, images=ImageOptions(), tracks=tracks if is_limited else options.tracks
-    )
+    chosen = replace(options, images=ImageOptions())
+    if any(own.tracked.video.sampled_ends is not None for own in images.videos):
+        chosen = replace(chosen, tracks=replace(options.tracks, min_length=MIN_IMAGES))
     run = Run(
         images.inputs,
         tuple(own.source for own in images.videos),

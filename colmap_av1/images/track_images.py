@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -102,25 +103,20 @@ def track_chosen_images(
         context: measures the stages of `track_video`, "choice" and "refinement".
 
     Raises:
-        OptionError: see `track_images` and `choose_images`, as the following.
-        VideoError: see there.
-        BitstreamError: see there.
-        ImageError: see there.
+        ImageError: see `track_images` and `choose_images`.
+        OptionError: see `track_images` and `choose_images`.
+        VideoError: see `track_images`.
+        BitstreamError: see `track_images`.
     """
-
-    def track(
-        choose: Callable[[TrackedVideo], ChosenImages], frames: NDArray[np.int32] | None = None
-    ) -> TrackedImages:
-        return track_images(
-            source,
-            options,
-            choose,
-            masks=masks,
-            display=choice.display,
-            one_size=one_size,
-            frames=frames,
-            context=context,
-        )
+    track = functools.partial(
+        track_images,
+        source,
+        options,
+        masks=masks,
+        display=choice.display,
+        one_size=one_size,
+        context=context,
+    )
 
     def choose(num_frames: int, tracks: Tracks | None = None) -> ChosenImages:
         return choose_images(
@@ -160,11 +156,11 @@ def track_chosen_images(
         return chosen
 
     frames = chosen.frames if len(chosen.frames) < num_frames else None
-    found = track(choose_again, frames)
+    found = track(choose_again, frames=frames)
     if frames is None or np.isin(found.chosen.frames, frames).all():
         return found
     # The new choice has frames whose observations were not kept.
-    return track(lambda _: found.chosen, found.chosen.frames)
+    return track(lambda _: found.chosen, frames=found.chosen.frames)
 
 
 def track_images(
@@ -218,7 +214,7 @@ def track_images(
         ends = _as_displayed(video.sampled_ends, source, display)
         if masks is not None:
             ends = masks.on_frames(ends, min_length=2)
-        # Of a track with one end in a masked or hidden place, it is not known how long it lasts.
+        # If one end of a track is masked or hidden, its length is not known.
         video = replace(video, sampled_ends=ends.keep_long(2))
     if masks is not None:
         video = replace(

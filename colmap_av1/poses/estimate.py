@@ -285,7 +285,7 @@ def split_at_seams(
         if posed.adjustment is None:
             break
         seams, num_images = _seams_to_split(posed), posed.adjustment.result.num_registered
-        parts = posed.mapped
+        parts = None
         if seams:
             parts = split_stage(
                 run,
@@ -296,13 +296,13 @@ def split_at_seams(
                 rival=posed.rival,
                 number=number,
             )
-        is_whole = not seams or parts.result.num_registered == num_images
-        if is_whole and only_certain:
+        if parts is None or parts.result.num_registered == num_images:
+            if not only_certain:
+                break
             seams = []
             parts = certain_stage(run, image_set, posed.mapped, posed.adjustment, number=number)
-            is_whole = parts.result.num_registered == num_images
-        if is_whole:
-            break
+            if parts.result.num_registered == num_images:
+                break
         if parts.result.num_registered == 0:
             return replace(posed, mapped=parts)
         frame_of = image_set.images.frame_of

@@ -115,19 +115,16 @@ def _parts_stage(
     name: str,
     key: Sequence[Any] = (),
 ) -> Kept[MappedResult]:
-    """Write the parts of an adjusted model.
+    """Write the parts of an adjusted model, see `split_stage`.
 
     Args:
-        run: the run.
-        image_set: all images.
-        mapped: the models of the mapper.
-        adjusted: the first of these, adjusted.
+        run: the run, as the next three.
+        image_set: see `split_stage`.
+        mapped: see there.
+        adjusted: see there.
         parts_of_model: returns the names of the images of each part.
         name: name of the stage.
         key: what the parts depend on in addition to the model.
-
-    Returns:
-        See `split_stage`.
     """
 
     def make(partial: Path) -> MappedResult:

@@ -25,9 +25,9 @@ def remove_overlays(tracks: Tracks, moving: Tracks | None = None) -> Tracks:
 
     Args:
         tracks: any tracks.
-        moving: tracks of the same video that show the motion of the picture; None: the tracks
-            themselves. Needed if `tracks` are observed in distant frames only, because then most of
-            those that are left may be overlays.
+        moving: tracks of the same video that show the motion of the picture; None or no tracks:
+            the tracks themselves. Needed if `tracks` are observed in distant frames only, because
+            then most of those that are left may be overlays.
 
     Returns:
         The other tracks in the same order; the same object if no track is removed.

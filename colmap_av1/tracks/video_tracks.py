@@ -265,8 +265,7 @@ def track_video(
             if stored is not None:  # the first showing of a frame may not be among the frames
                 tracks = tracks.keep_frames(stored[stored < tracks.num_frames])
             num_frames, num_tracks = tracks.num_frames, tracks.num_tracks
-            tracks = remove_overlays(tracks, ends if coded is not None else None)
-            ends = remove_overlays(ends)
+            tracks, ends = remove_overlays(tracks, ends), remove_overlays(ends)
             overlay_share = (num_tracks - tracks.num_tracks) / max(num_tracks, 1)
             num_pixels = num_frames * width * height
             tracks, ends = _as_shown(tracks, source), _as_shown(ends, source)

@@ -108,7 +108,7 @@ void check_tracks(const TrackArrays& tracks, const TrackBuilderOptions& options)
   }
 }
 
-// `ends` of all tracks, which are observed in all frames
+// All frames are observed, and the ends of all tracks are kept.
 void check_ends(const TrackArrays& ends, const TrackArrays& tracks) {
   check(ends.offsets.size() == tracks.offsets.size(), "every track has ends");
   for (std::size_t t = 0; t + 1 < tracks.offsets.size(); ++t) {

@@ -233,14 +233,10 @@ class Contradictions:
         """
         agreeing = self._agreeing & ~left_out & (self._placed.lengths >= _LONG)
         found = np.zeros(self._placed.shape)
-
-        def count(image: int) -> None:
-            shown = self._shown(image)
+        images = map_on_threads(self._shown, range(len(found)), self._num_threads)
+        for own, shown in zip(found, images, strict=True):
             kept = agreeing[shown.track]
-            np.add.at(found[image], (shown.row[kept], shown.column[kept]), 1.0)
-
-        for _ in map_on_threads(count, range(len(found)), self._num_threads):
-            pass
+            np.add.at(own, (shown.row[kept], shown.column[kept]), 1.0)
         return found
 
     @property
