@@ -27,9 +27,8 @@ REFERENCE = "sift-exhaustive"
 
 # The ways to start training whose renderings are compared; the first is the baseline.
 SPLAT_WAYS = (
-    *("SIFT sequential", "reconstruct"),
-    *("reconstruct --gaussians", "reconstruct --gaussians, none added"),
-    "densify --gaussians, SIFT's poses",
+    *("SIFT sequential", "match, map, densify", "reconstruct"),
+    *("reconstruct, none added", "reconstruct --gaussians"),
 )
 _QUALITIES = ("psnr_y", "ssim_db", "vmaf")
 

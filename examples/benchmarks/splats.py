@@ -2,10 +2,10 @@
 
 python examples/benchmarks/splats.py --cache benchmark_phone
 
-For each clip, the two folders of `phone_to_folder.py` are created in its cache. Gaussians are
-trained on half of the images of each, from its poses and points, and rendered for the other half.
-For `reconstruct`, training also starts from the Gaussians of `--gaussians`, with and without
-densification, and from those of `densify --gaussians` on SIFT's poses.
+For each clip, the folders of `reconstruct` and of SIFT by `phone_to_folder.py` are created in its
+cache, and a model by `match`, `map` and `densify`. Gaussians are trained on half of the images of
+each, from its poses and points, and rendered for the other half. For `reconstruct`, they are also
+trained without densification, and from the Gaussians of `--gaussians`.
 
 All pictures are undistorted by the code of `reconstruct`, because renderings score higher against
 the slightly softer pictures of another program. The trainer is a small one for CPUs,
@@ -20,7 +20,7 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,8 @@ from phone_to_folder import Clip
 from results import Value, add_results, read_rows, save
 from rich.console import Console
 
-from colmap_av1 import DensifyOptions, ImageOptions, MatchOptions, densify
+import colmap_av1
+from colmap_av1 import DensifyOptions, ImageOptions, MatchOptions, densify, map_database
 from colmap_av1.geometry.colmap_model import model_points, posed_images, read_model, write_model
 from colmap_av1.geometry.undistortion import on_pinholes, pinhole_camera, undistortion
 from colmap_av1.splats.gaussians import write_model_gaussians
@@ -44,8 +45,7 @@ from colmap_av1.util.stages import run_stage_in
 
 TRAINER = ruler.SEQUENCES.parent / "tools" / "gs_cpu"
 FROM_GAUSSIANS = Path(__file__).with_name("train_from_gaussians.py")
-OURS = render.SPLAT_WAYS[1:-1]
-GAUSSIANS, NONE_ADDED, ON_SIFT = render.SPLAT_WAYS[-3:]
+SIFT, DROP_IN, _, NONE_ADDED, GAUSSIANS = render.SPLAT_WAYS
 # Options of images, for clips where they differ from `phone_to_folder.py`.
 IMAGES = {"kitchen": ImageOptions(every=4)}
 WIDTH, ITERATIONS = 225, 3000
@@ -64,7 +64,7 @@ def main() -> int:
     parser.add_argument(
         "--clips",
         nargs="+",
-        default=["log_building", "ditch", "holiday_display", "kitchen"],
+        default=["log_building", "ditch", "holiday_display", "kitchen", "street"],
         metavar="NAME",
         help="sequences of ../shared",
     )
@@ -92,33 +92,49 @@ def main() -> int:
 
 def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
     """The undistorted images and model of a clip by one way."""
+    if way == DROP_IN:
+        given: list[Any] = [file_digest(clip.video), clip.images, clip.camera]
+        return undistorted(folder / "splats" / "match", given, lambda output: match(clip, output))
     *_, output = phone_to_folder.folder_of(clip, folder / "reconstruct")
-    if way in OURS:
+    if way != SIFT:
         return output / "images", output / "sparse" / "0"
     names = sorted(path.name for path in (output / "images").iterdir())
-    undistorted = folder / "splats" / "sift"
-    images, model = undistorted / "images", undistorted / "model"
-    given = [file_digest(clip.video), names, clip.camera, pycolmap.__version__]
 
-    def map_sift() -> dict[str, Any]:
-        _, found, pictures = phone_to_folder.sift_of(clip, folder / "sift", names, mapped=True)
-        if found is None:
+    def sift(_folder: Path) -> tuple[Path, Path]:
+        _steps, model, pictures = phone_to_folder.sift_of(clip, folder / "sift", names, mapped=True)
+        if model is None:
             raise SystemExit(f"{clip.name}: SIFT made no model")
-        shutil.copytree(found, undistorted / "distorted")
+        return pictures, model
+
+    given = [file_digest(clip.video), names, clip.camera, pycolmap.__version__]
+    return undistorted(folder / "splats" / "sift", given, sift)
+
+
+def match(clip: Clip, folder: Path) -> tuple[Path, Path]:
+    """The images and model of a clip by `match`, `map` and `densify`."""
+    database, images, mapped = folder / "a.db", folder / "distorted_images", folder / "mapped"
+    options = MatchOptions(images=clip.images, camera=clip.camera)
+    report = colmap_av1.match(database, clip.video, image_path=images, options=options)
+    map_database(database, images, mapped, options=report.map_options)
+    dense = folder / "dense"
+    densify(mapped / "0", clip.video, dense, options=DensifyOptions(match=options))
+    return images, dense
+
+
+def undistorted(
+    folder: Path, given: list[Any], make: Callable[[Path], tuple[Path, Path]]
+) -> tuple[Path, Path]:
+    """The undistorted images and model that `make` returns, made once for the same `given`."""
+    images, model = folder / "images", folder / "model"
+
+    def run() -> dict[str, Any]:
+        pictures, distorted = make(folder)
         images.mkdir()
-        undistort_images(found, pictures, images)
-        undistort_model(found, model)
+        undistort_images(distorted, pictures, images)
+        undistort_model(distorted, model)
         return {}
 
-    products = [undistorted / "distorted", images, model]
-    run_stage_in(undistorted, given, map_sift, products=products)
-    if way == ON_SIFT:
-        dense = folder / "splats" / "densify"
-        shutil.rmtree(dense, ignore_errors=True)
-        options = DensifyOptions(match=MatchOptions(images=clip.images, camera=clip.camera))
-        densify(undistorted / "distorted", clip.video, dense / "distorted", options=options)
-        undistort_model(dense / "distorted", dense / "model")
-        model = dense / "model"
+    run_stage_in(folder, given, run, products=[images, model])
     return images, model
 
 
@@ -154,7 +170,7 @@ def train(
     output.mkdir(parents=True)
     run = [sys.executable, str(TRAINER / "colmap_to_npz.py"), str(model), str(cloud)]
     subprocess.run([*run, "--images", str(images)], check=True, capture_output=True)
-    if way in (GAUSSIANS, NONE_ADDED, ON_SIFT):
+    if way == GAUSSIANS:
         write_model_gaussians(folder / "init.ply", model)
         run = [sys.executable, str(FROM_GAUSSIANS), str(folder / "init.ply"), str(TRAINER)]
     else:
