@@ -200,18 +200,20 @@ def _parse(
     video: str | PathLike[str],
     options: ReadOptions,
 ) -> Iterator[_core.Event]:
-    """Parse a packet; the events before an error are yielded before it is raised."""
-    try:
-        parser.parse(data)
-    except _core.BitstreamError as error:
-        yield from parser.take_events()
-        raise BitstreamError(f"{video}: {error}") from error
-    except _core.LimitError as error:
-        yield from parser.take_events()
-        raise LimitError(
-            f"{video}: {error} of {options.max_frame_size} samples: allow more with max_frame_size"
-        ) from error
-    yield from parser.take_events()
+    """Parse a packet; each event is yielded before the next frame is parsed."""
+    position = 0
+    while position < len(data):
+        try:
+            event, position = parser.parse(data, position)
+        except _core.BitstreamError as error:
+            raise BitstreamError(f"{video}: {error}") from error
+        except _core.LimitError as error:
+            raise LimitError(
+                f"{video}: {error} of {options.max_frame_size} samples: allow more with "
+                "max_frame_size"
+            ) from error
+        if event is not None:
+            yield event
 
 
 def _read_events(

@@ -207,12 +207,15 @@ class Tracks:
         so_far = np.concatenate([[0], np.cumsum(counted[self.frame])])
         return self.keep_tracks(np.diff(so_far[self.offsets]) >= min_frames)
 
-    def with_repeats(self, first: NDArray[np.int32]) -> Tracks:
+    def with_repeats(
+        self, first: NDArray[np.int32], frames: NDArray[np.int32] | None = None
+    ) -> Tracks:
         """Observe pictures that are shown again as at their first showing.
 
         Args:
             first: int32 [n] for each frame the frame that first shows its picture; n is at least
                 `num_frames`.
+            frames: int32 [m] the only frames that get observations; None: all.
 
         Returns:
             Tracks in the same order; the same object if no picture is shown again.
@@ -220,6 +223,8 @@ class Tracks:
         repeats = np.flatnonzero(first != np.arange(len(first)))
         if len(repeats) == 0:
             return self
+        if frames is not None:  # copying all observations of a still picture needs much memory
+            repeats = repeats[np.isin(repeats, frames)]
         # The observations of each frame, and how often they are repeated.
         order, bounds = self.by_frame()
         copies = [order[bounds[frame] : bounds[frame + 1]] for frame in first[repeats].tolist()]
@@ -390,7 +395,7 @@ def build_tracks_and_ends(
     progress: Progress,
     *,
     frames: NDArray[np.int32] | None,
-    ends_of: int = 0,
+    tracks_per_sample: int = 0,
 ) -> tuple[Tracks, Tracks]:
     """Chain the motion of a video into point tracks, and sample their ends in all frames.
 
@@ -398,8 +403,8 @@ def build_tracks_and_ends(
         motion: see `build_tracks`, as the next three.
         options: how to chain.
         progress: called after each coded frame.
-        frames: int32 [n] display indices of the frames whose observations are kept; None: all.
-        ends_of: the ends of one in this many tracks are returned; 0: of none.
+        frames: int32 [n] display indices of the frames whose observations are stored; None: all.
+        tracks_per_sample: the ends of one in this many tracks are returned; 0: of none.
 
     Returns:
         The tracks, see `build_tracks`. The first and the last observation of some tracks in all
@@ -411,9 +416,9 @@ def build_tracks_and_ends(
         ValueError: see `build_tracks`.
     """
     core_options = _core_options(options)
-    core_options.ends_of = ends_of
+    core_options.tracks_per_sample = tracks_per_sample
     if frames is not None:
-        core_options.observed = frames.tolist()
+        core_options.stored_frames = frames.tolist()
     builder = _core.TrackBuilder(core_options)
     for count, frame in enumerate(motion, start=1):
         if not isinstance(frame, FrameMotion):

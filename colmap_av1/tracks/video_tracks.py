@@ -258,10 +258,14 @@ def track_video(
             width, height = source.stream.picture_size
             one_in = max(1, width * height // (_PIXELS_PER_TRACK * _ENDS_PER_FRAME))
             tracks, ends = build_tracks_and_ends(
-                motion, options.tracks, count, frames=coded, ends_of=0 if coded is None else one_in
+                motion,
+                options.tracks,
+                count,
+                frames=coded,
+                tracks_per_sample=0 if coded is None else one_in,
             )
             first = first[: count_with_repeats(first, tracks.num_frames)]
-            tracks, ends = tracks.with_repeats(first), ends.with_repeats(first)
+            tracks, ends = tracks.with_repeats(first, stored), ends.with_repeats(first)
             if stored is not None:  # the first showing of a frame may not be among the frames
                 tracks = tracks.keep_frames(stored[stored < tracks.num_frames])
             num_frames, num_tracks = tracks.num_frames, tracks.num_tracks

@@ -236,8 +236,10 @@ def parse(units: list[bytes]) -> int:
     parser = _core.Parser(num_threads=1)
     frames = 0
     for unit in units:
-        parser.parse(unit)
-        frames += len(parser.take_events())
+        position = 0
+        while position < len(unit):
+            event, position = parser.parse(unit, position)
+            frames += event is not None
     parser.finish()
     return frames
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from block_data import blank_blocks, frame_of_blocks
+from conformance import parse
 from conftest import PROJECT, SHARED, TEST_PATHS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -287,6 +288,18 @@ def test_max_frame_size_is_the_limit() -> None:
         next(read_motion(stream, ReadOptions(max_frame_size=samples - 1)))
 
 
+def test_frames_of_a_large_packet_are_parsed_one_at_a_time() -> None:
+    # Otherwise a packet of a few kilobytes with many frames of one colour would need gigabytes.
+    start = obu(2, b"") + still_picture_sequence(64, 64)
+    frame = obu(3, bytes([0b00011000, 255, 0, 0, 0, 0x80])) + obu(4, b"\x07\x80")
+    data = start + 3 * frame
+    parser, position = _core.Parser(), 0
+    for number in (1, 2, 3):
+        event, position = parser.parse(data, position)
+        assert event is not None
+        assert position == len(start) + number * len(frame)
+
+
 def test_tile_groups_after_a_damaged_one_do_not_complete_the_frame() -> None:
     # Two tiles of one superblock: a header with uniform spacing, one increment, base_q_idx 255.
     start = obu(2, b"") + still_picture_sequence(128, 64)
@@ -301,15 +314,12 @@ def test_tile_groups_after_a_damaged_one_do_not_complete_the_frame() -> None:
         )
     )
     parser = _core.Parser()
-    parser.parse(start + first + second)
-    assert len(parser.take_events()) == 1
+    assert len(parse(parser, start + first + second)) == 1
     with pytest.raises(_core.BitstreamError):
-        parser.parse(start + damaged)
+        parse(parser, start + damaged)
     with pytest.raises(_core.BitstreamError, match="tile group"):
-        parser.parse(second)
-    assert parser.take_events() == []
-    parser.parse(start + first + second)
-    assert len(parser.take_events()) == 1
+        parse(parser, second)
+    assert len(parse(parser, start + first + second)) == 1
 
 
 # --- tiles with trailing bits that violate the specification -----------------------------------
@@ -392,16 +402,14 @@ def test_tile_with_data_after_its_symbols_is_damaged() -> None:
         (b"\x07\x00", 1),
         (b"\x07\x81", 1),
     ):
-        parser = _core.Parser()
-        parser.parse(start + frame + obu(4, tile))
-        (event,) = parser.take_events()
+        (event,) = parse(_core.Parser(), start + frame + obu(4, tile))
         assert event.num_wrong_trailing_bits == wrong
         if wrong:
             with pytest.raises(_core.BitstreamError, match="bits"):
-                _core.Parser(strict=True).parse(start + frame + obu(4, tile))
+                parse(_core.Parser(strict=True), start + frame + obu(4, tile))
     for end in (b"\x80\0\1", b"\x80\x80\x80", b"\0\0\0"):
         with pytest.raises(_core.BitstreamError, match="symbol"):
-            _core.Parser().parse(start + frame + obu(4, b"\x07" + end))
+            parse(_core.Parser(), start + frame + obu(4, b"\x07" + end))
 
 
 # --- any damage to a small stream -------------------------------------------------------------
@@ -499,15 +507,16 @@ def test_parser_recovers_after_any_damage(
     # A temporal delimiter ends an incomplete frame with an error.
     delimiter = obu(2, b"")
     for index, unit in enumerate([*split_units(data), delimiter, *split_units(whole)]):
+        position = 0
         try:
-            parser.parse(unit)
+            while position < len(unit):
+                event, position = parser.parse(unit, position)
+                if event is not None and not event.header()["show_existing_frame"]:
+                    blocks, block_index, _ = event.take_blocks()
+                    units = blocks.view(BLOCK)[block_index]
+                    found.append((index, digest({name: units[name] for name in _UNIT_FIELDS})))
         except (_core.BitstreamError, _core.LimitError):
             failed_at = index if failed_at is None else failed_at
-        for event in parser.take_events():
-            if not event.header()["show_existing_frame"]:
-                blocks, block_index, _ = event.take_blocks()
-                units = blocks.view(BLOCK)[block_index]
-                found.append((index, digest({name: units[name] for name in _UNIT_FIELDS})))
     intact = units_before(whole, position)
     assert failed_at is None or failed_at >= intact
     expected = undamaged[source]

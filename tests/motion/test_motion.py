@@ -154,8 +154,11 @@ parser = _core.Parser(num_threads=4)
 data = Path(sys.argv[1]).read_bytes()
 used = 4096 * int(Path("/proc/self/statm").read_text().split()[0])
 resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 29), resource.RLIM_INFINITY))
-parser.parse(data)
-print(len(parser.take_events()))
+num_frames = position = 0
+while position < len(data):
+    event, position = parser.parse(data, position)
+    num_frames += event is not None
+print(num_frames)
 """
 
 

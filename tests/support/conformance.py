@@ -42,6 +42,17 @@ _CONDITIONAL = {
 _MULTIPLIERS = ("delta_q_res", "delta_lf_res")
 
 
+def parse(parser: _core.Parser, data: bytes | memoryview) -> list[_core.Event]:
+    """Parse a temporal unit or a part of one; returns its events."""
+    events: list[_core.Event] = []
+    position = 0
+    while position < len(data):
+        event, position = parser.parse(data, position)
+        if event is not None:
+            events.append(event)
+    return events
+
+
 def read_events(stream: Path) -> tuple[list[Any], dict[str, int]]:
     """Events of a stream with their blocks, and the first sequence header."""
     parser = _core.Parser()
@@ -51,8 +62,7 @@ def read_events(stream: Path) -> tuple[list[Any], dict[str, int]]:
         if opened.configuration:
             parser.parse(opened.configuration)
         for packet in opened.packets():
-            parser.parse(packet.data)
-            events += parser.take_events()
+            events += parse(parser, packet.data)
             sequence = sequence or parser.sequence_header()
     parser.finish()
     assert sequence is not None

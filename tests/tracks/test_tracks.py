@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from colmap_av1 import _core
 from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import BLOCK, FrameMotion
 from colmap_av1.motion.reading import read_motion
@@ -454,6 +455,16 @@ def test_hidden_frames_continue_tracks_without_observations() -> None:
         np.testing.assert_array_equal(xy[0] - xy, np.outer([0, 2, 4, 5], step))
 
 
+def test_frame_that_a_later_header_shows_is_chained_when_it_leaves_its_slot() -> None:
+    # No frame has show_frame. The second frame is in no slot after the third, so it has been shown.
+    builder = _core.TrackBuilder(_core.TrackBuilderOptions())
+    for number, display, slots in ((0, 0, [0]), (1, 2, [0, 1]), (2, 3, [0, 2])):
+        builder.add(frame(number, display, slots=slots, shown=False))
+    with pytest.raises(ValueError, match="order"):
+        builder.add(frame(3, 1, slots=[0, 2, 3], shown=False))
+    builder.add(frame(4, 4, slots=[0, 2, 4], shown=False))
+
+
 def test_second_list_is_used_if_the_first_finds_no_track() -> None:
     # The nearer reference is in a slot that was never coded here.
     frames = low_delay([(1.0, 0.0)] * 3)
@@ -871,11 +882,14 @@ def random_video(draw: st.DrawFn) -> list[FrameMotion]:
     shown = [-1] * count
     at_once = rng.random(count) < 0.6
     waiting: list[int] = []
+    waiting_after: list[list[int]] = []
     order: list[int] = []
     for i in range(count):
         if waiting and rng.random() < 0.4:
             order.append(waiting.pop(rng.integers(len(waiting))))
+        at_once[i] |= len(waiting) > 4
         (order if at_once[i] else waiting).append(i)
+        waiting_after.append(list(waiting))
     for i, index in enumerate(order):
         shown[index] = i
     slots = np.full(8, -1)
@@ -905,7 +919,9 @@ def random_video(draw: st.DrawFn) -> list[FrameMotion]:
             base = replace(
                 base, local_warp_params=params + rng.integers(-3000, 3000, (1, 6), np.int32)
             )
-        slots[rng.random(8) < 0.4] = i
+        # A frame stays in a reference slot until it is shown.
+        free = np.flatnonzero(~np.isin(slots, waiting_after[i]))
+        slots[free[:1] if i in waiting_after[i] else free[rng.random(len(free)) < 0.4]] = i
         frames.append(replace(base, slot_decode_index=slots.astype(np.int32)))
     return frames
 
@@ -965,7 +981,7 @@ def test_ends_are_those_in_all_frames(
         return
     tracks = build_tracks(motion, options)
     one = np.array([0], np.int32)
-    _, ends = build_tracks_and_ends(motion, options, no_progress, frames=one, ends_of=of)
+    _, ends = build_tracks_and_ends(motion, options, no_progress, frames=one, tracks_per_sample=of)
     assert ends.num_frames == tracks.num_frames
 
     def first_and_last(tracks: Tracks) -> set[tuple[float, ...]]:

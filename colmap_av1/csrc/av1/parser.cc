@@ -60,9 +60,10 @@ class JoinedThreads {
 
 }  // namespace
 
-void Parser::parse(Bytes data) {
+std::unique_ptr<Event> Parser::parse(Bytes data, std::size_t& position) {
   try {
-    parse_obus(data);
+    parse_obus(data, position);
+    return std::move(complete_event_);
   } catch (...) {
     // A damaged frame is dropped: later tile groups must not complete it.
     seen_frame_header_ = false;
@@ -87,13 +88,12 @@ void Parser::restart(const RestartPoint& point) {
   shown_spatial_id_ = point.shown_spatial_id;
   slots_ = {};
   seen_frame_header_ = false;
-  events_.clear();
 }
 
 // 5.3 OBU syntax
-void Parser::parse_obus(Bytes data) {
-  Bytes rest = data;
-  while (!rest.empty()) {
+void Parser::parse_obus(Bytes data, std::size_t& position) {
+  Bytes rest = data.subspan(position);
+  while (!rest.empty() && complete_event_ == nullptr) {
     obu_offset_ = data.size() - rest.size();
     const std::uint8_t header = rest.front();
     rest = rest.subspan(1);
@@ -139,6 +139,7 @@ void Parser::parse_obus(Bytes data) {
         break;
     }
   }
+  position = data.size() - rest.size();
 }
 
 void Parser::sequence_header_obu(Bytes data) {
@@ -239,7 +240,6 @@ void Parser::start_frame() {
     event_->ref_decode_index[ref] = refs[ref]->decode_index;
     event_->ref_size[ref] = {reference.upscaled_width, reference.frame_height};
   }
-  event_->ref_order_hint = header_.order_hints;
   if (options_.headers_only) return;
 
   const std::size_t units =
@@ -444,7 +444,7 @@ void Parser::finish_frame() {
   update_references(state_, header_.refresh_frame_flags);
   state_.reset();
   ++num_events_;
-  events_.push_back(std::move(event_));
+  complete_event_ = std::move(event_);
 }
 
 void Parser::show_existing_frame() {
@@ -458,7 +458,7 @@ void Parser::show_existing_frame() {
     update_references(nullptr, 0);
   }
   ++num_events_;
-  events_.push_back(std::move(event_));
+  complete_event_ = std::move(event_);
 }
 
 // 7.20 Reference frame update process

@@ -1,4 +1,4 @@
-// The parser reads temporal units and gives one event per decoded or repeated frame.
+// The parser reads temporal units and returns one event per decoded or repeated frame.
 #pragma once
 
 #include <array>
@@ -37,7 +37,6 @@ struct Event {
   // By RefFrame; -1 and 0 if there is no frame.
   std::array<int, TOTAL_REFS_PER_FRAME> ref_decode_index{};
   std::array<std::array<int, 2>, TOTAL_REFS_PER_FRAME> ref_size{};  // UpscaledWidth, FrameHeight
-  std::array<int, TOTAL_REFS_PER_FRAME> ref_order_hint{};
   // Reference slots after the reference frame update process
   std::array<int, NUM_REF_FRAMES> slot_decode_index{};
   std::vector<BlockInfo> blocks;          // in decoding order
@@ -60,11 +59,12 @@ class Parser {
  public:
   explicit Parser(const ParserOptions& options) : options_(options) {}
 
-  // Parses a temporal unit, or a part of one, of the low-overhead format (section 5.2). An OBU
-  // without a size field extends to the end of the data. Complete frames are appended to events()
-  // even if a later frame throws BitstreamError or LimitError. That frame is dropped, and the
-  // reference slots that it would have refreshed keep their frames.
-  void parse(std::span<const std::uint8_t> data);
+  // Parses a temporal unit, or a part of one, of the low-overhead format (section 5.2) from
+  // `position`, in bytes, to the end of the next frame or of the data, and moves `position` there.
+  // Returns the frame; null if none ends. An OBU without a size field extends to the end of the
+  // data. Throws BitstreamError or LimitError; the frame is then dropped, and the reference slots
+  // that it would have refreshed keep their frames.
+  std::unique_ptr<Event> parse(std::span<const std::uint8_t> data, std::size_t& position);
 
   // Throws BitstreamError if the stream ends inside a frame.
   void finish() const;
@@ -75,7 +75,6 @@ class Parser {
   // shown key frame, frames that refer to other frames are errors.
   void restart(const RestartPoint& point);
 
-  std::vector<std::unique_ptr<Event>>& events() { return events_; }
   // The current sequence header; null before the first one.
   const SequenceHeader* sequence_header() const { return seq_.get(); }
   int operating_point_idc() const { return operating_point_idc_; }
@@ -91,7 +90,7 @@ class Parser {
     ++temporal_unit_;
     shown_spatial_id_ = -1;
   }
-  void parse_obus(std::span<const std::uint8_t> data);
+  void parse_obus(std::span<const std::uint8_t> data, std::size_t& position);
   void sequence_header_obu(std::span<const std::uint8_t> data);
   // Returns the size of the header in bytes.
   std::size_t frame_header_obu(std::span<const std::uint8_t> data, int temporal_id, int spatial_id);
@@ -110,7 +109,6 @@ class Parser {
   std::array<const FrameState*, TOTAL_REFS_PER_FRAME> references() const;
 
   ParserOptions options_;
-  std::vector<std::unique_ptr<Event>> events_;
   std::shared_ptr<const SequenceHeader> seq_;
   int operating_point_idc_ = 0;
   std::array<Slot, NUM_REF_FRAMES> slots_;
@@ -122,7 +120,8 @@ class Parser {
   bool seen_frame_header_ = false;
   int tile_num_ = 0;
   FrameHeader header_;
-  std::unique_ptr<Event> event_;
+  std::unique_ptr<Event> event_;  // of the current frame
+  std::unique_ptr<Event> complete_event_;
   std::shared_ptr<FrameState> state_;
   FrameContext context_;
   std::vector<std::size_t> tile_first_block_;

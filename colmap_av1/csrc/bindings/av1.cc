@@ -1,6 +1,8 @@
 #include "bindings/av1.h"
 
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/unique_ptr.h>
 
 #include <cstddef>
 #include <cstdint>
@@ -106,7 +108,7 @@ nb::dict header_dict(const Event& event) {
   d["num_tile_groups"] = event.num_tile_groups;
   d["skip_mode_frame"] = int32_array(h.skip_mode_frame);
   d["ref_frame_idx"] = int32_array(h.ref_frame_idx);
-  d["ref_order_hint"] = int32_array(event.ref_order_hint, 1);
+  d["ref_order_hint"] = int32_array(h.order_hints, 1);
   d["gm_type"] = int32_array(h.gm_type, 1);
   std::vector<std::int32_t> gm;
   for (int ref = av1::LAST_FRAME; ref <= av1::ALTREF_FRAME; ++ref) {
@@ -218,24 +220,20 @@ void bind_av1(nb::module_& m) {
           "strict"_a = false, "max_frame_size"_a = std::int64_t{1} << 28)
       .def(
           "parse",
-          [](Parser& self, nb::object data) {
+          [](Parser& self, nb::object data, std::size_t position) {
             const Buffer bytes(data);
-            nb::gil_scoped_release release;
-            self.parse(bytes.get());
+            if (position > bytes.get().size()) throw std::out_of_range("position");
+            std::unique_ptr<Event> event;
+            {
+              nb::gil_scoped_release release;
+              event = self.parse(bytes.get(), position);
+            }
+            return std::make_pair(std::move(event), position);
           },
-          "data"_a)
+          "data"_a, "position"_a = 0)
       .def("finish", &Parser::finish)
       .def("restart_point", &Parser::restart_point)
       .def("restart", &Parser::restart, "point"_a)
-      .def("take_events",
-           [](Parser& self) {
-             nb::list list;
-             for (auto& event : self.events()) {
-               list.append(nb::cast(event.release(), nb::rv_policy::take_ownership));
-             }
-             self.events().clear();
-             return list;
-           })
       .def("sequence_header", [](const Parser& self) -> nb::object {
         if (self.sequence_header() == nullptr) return nb::none();
         return sequence_dict(*self.sequence_header(), self.operating_point_idc());

@@ -85,8 +85,8 @@ void bind_options(nb::module_& m) {
       .def_rw("bridge", &TrackBuilderOptions::bridge)
       .def_rw("cells", &TrackBuilderOptions::cells)
       .def_rw("seeding", &TrackBuilderOptions::seeding)
-      .def_rw("observed", &TrackBuilderOptions::observed)
-      .def_rw("ends_of", &TrackBuilderOptions::ends_of);
+      .def_rw("stored_frames", &TrackBuilderOptions::stored_frames)
+      .def_rw("tracks_per_sample", &TrackBuilderOptions::tracks_per_sample);
 }
 
 }  // namespace

@@ -38,19 +38,19 @@ struct Group {
   std::optional<RestartPoint> start;  // none at the start of the stream
 };
 
-// Parses a packet and moves its events out; false if the packet is damaged.
+// Parses a packet and appends its events; false if the packet is damaged.
 bool parse(Parser& parser, const Packet& packet, Events& events) {
-  bool whole = true;
   try {
-    parser.parse(packet);
+    for (std::size_t position = 0; position < packet.size();) {
+      auto event = parser.parse(packet, position);
+      if (event != nullptr) events.push_back(std::move(event));
+    }
   } catch (const BitstreamError&) {
-    whole = false;
+    return false;
   } catch (const LimitError&) {
-    whole = false;
+    return false;
   }
-  events = std::move(parser.events());
-  parser.events().clear();
-  return whole;
+  return true;
 }
 
 std::vector<Group> groups_of(const std::vector<Packet>& packets, ParserOptions options) {

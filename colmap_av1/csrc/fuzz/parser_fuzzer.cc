@@ -79,13 +79,15 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     // The parser gets a copy, so that a read past the unit is a read past an allocation.
     const std::vector<std::uint8_t> copy(unit.begin(), unit.end());
     try {
-      parser.parse(copy);
+      for (std::size_t position = 0; position < copy.size();) {
+        const auto event = parser.parse(copy, position);
+        if (event == nullptr) continue;
+        ++num_events;
+        check_event(*event, options);
+      }
     } catch (const BitstreamError&) {  // a caller may continue after an error
     } catch (const LimitError&) {
     }
-    num_events += parser.events().size();
-    for (const auto& event : parser.events()) check_event(*event, options);
-    parser.events().clear();
   };
   while (!input.empty() && num_events < kMaxEvents) {
     const auto unit = input.unit();

@@ -68,7 +68,7 @@ TrackBuilderOptions read_options(Input& input) {
   if ((choice & 1) != 0) options.bridge = 2;
   options.cells = 1 << (((choice >> 3) & 1) + ((choice >> 5) & 1));
   if ((choice & 64) != 0) options.seeding = (choice & 128) != 0 ? 2 * options.cells : options.cells;
-  options.ends_of = 1;
+  options.tracks_per_sample = 1;
   return options;
 }
 
@@ -126,15 +126,19 @@ std::vector<std::unique_ptr<Event>> parse(Input& input, bool headers_only, std::
   options.headers_only = headers_only;
   options.max_frame_size = kMaxFrameSize;
   Parser parser(options);
+  std::vector<std::unique_ptr<Event>> events;
   try {
-    while (!input.empty() && parser.events().size() < max_events) {
+    while (!input.empty() && events.size() < max_events) {
       const auto unit = input.unit();
-      parser.parse(unit);
+      for (std::size_t position = 0; position < unit.size();) {
+        auto event = parser.parse(unit, position);
+        if (event != nullptr) events.push_back(std::move(event));
+      }
     }
   } catch (const BitstreamError&) {
   } catch (const LimitError&) {
   }
-  return std::move(parser.events());
+  return events;
 }
 
 // Converts events to frames like `read_motion` (motion/reading.py)

@@ -40,27 +40,33 @@ std::vector<std::uint8_t> select_spread(const TrackView& tracks,
                                         const SpreadOptions& options) {
   check(tracks, order);
   const std::size_t total = tracks.frame.size();
+  // Narrower cells would select hardly more tracks, and need much memory.
+  const double width = std::max(1.0, options.spacing);
+  const auto cell_at = [width](float value) {
+    return static_cast<std::int64_t>(static_cast<double>(value) / width);
+  };
   // The grid of every picture extends to the outermost observation.
   std::int64_t cols = 1;
   std::int64_t rows = 1;
-  const auto cell_at = [&](float value) {
-    return static_cast<std::int64_t>(static_cast<double>(value) / options.spacing);
-  };
   std::vector<std::int64_t> cell;
+  std::int64_t num_pictures = 0;  // with observations
   if (options.spacing > 0) {
+    std::vector<std::int64_t> number(static_cast<std::size_t>(tracks.num_frames), -1);
+    for (const std::int32_t frame : tracks.frame) {
+      std::int64_t& own = number[static_cast<std::size_t>(frame)];
+      if (own < 0) own = num_pictures++;
+    }
     for (std::size_t i = 0; i < total; ++i) {
       cols = std::max(cols, cell_at(tracks.xy[2 * i]) + 1);
       rows = std::max(rows, cell_at(tracks.xy[2 * i + 1]) + 1);
     }
     cell.resize(total);
     for (std::size_t i = 0; i < total; ++i) {
-      cell[i] = (tracks.frame[i] * rows + cell_at(tracks.xy[2 * i + 1])) * cols +
-                cell_at(tracks.xy[2 * i]);
+      const std::int64_t picture = number[static_cast<std::size_t>(tracks.frame[i])];
+      cell[i] = (picture * rows + cell_at(tracks.xy[2 * i + 1])) * cols + cell_at(tracks.xy[2 * i]);
     }
   }
-  std::vector<std::uint8_t> taken(cell.empty() ? 0
-                                               : static_cast<std::size_t>(tracks.num_frames) *
-                                                     static_cast<std::size_t>(rows * cols));
+  std::vector<std::uint8_t> taken(static_cast<std::size_t>(num_pictures * rows * cols));
   std::vector<std::int32_t> count(static_cast<std::size_t>(tracks.num_frames));
   std::vector<std::uint8_t> kept(total);
   const auto is_full = [&](std::int32_t frame) {

@@ -8,7 +8,7 @@
 namespace colmap_av1::tracks {
 
 struct SpreadOptions {
-  double spacing = 0;            // average px between the tracks of a picture; 0: no limit
+  double spacing = 0;            // width of the cells in px, at least 1; 0: no cells
   int max_tracks_per_image = 0;  // 0: no limit
   int min_length = 1;
 };

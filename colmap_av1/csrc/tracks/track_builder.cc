@@ -7,6 +7,13 @@
 #include <utility>
 
 namespace colmap_av1::tracks {
+namespace {
+
+bool is_in(std::span<const std::int32_t> slots, const ChainedFrame& frame) {
+  return std::ranges::find(slots, frame.motion.decode_index) != slots.end();
+}
+
+}  // namespace
 
 TrackBuilder::TrackBuilder(const TrackBuilderOptions& options)
     : options_(options),
@@ -19,7 +26,7 @@ TrackBuilder::TrackBuilder(const TrackBuilderOptions& options)
       size > 2 * options.cells) {
     throw std::invalid_argument("cells are 1, 2 or 4, seeding one of these, to twice as many");
   }
-  if (options.ends_of < 0) throw std::invalid_argument("ends_of is negative");
+  if (options.tracks_per_sample < 0) throw std::invalid_argument("tracks_per_sample is negative");
 }
 
 void TrackBuilder::add(const FrameMotion& coded) {
@@ -30,13 +37,17 @@ void TrackBuilder::add(const FrameMotion& coded) {
     num_frames_ = std::max(num_frames_, coded.display_index + 1);
   }
   ChainedFrame& frame = read_frame(coded);
-  if (!frame.is_shown()) {
-    chain_frame(frame);
-  } else if (coded.show_frame) {
-    // Frames are output in display order, so all frames before this one have been read.
-    last_display_ = coded.display_index;
-    chain_up_to(coded.display_index);
+  if (!frame.is_shown()) chain_frame(frame);
+  // A shown frame that is in no reference slot has been output. Frames are output in display order,
+  // so all frames before it have been read.
+  for (const auto& other : frames_) {
+    const bool is_output =
+        other.get() == &frame ? coded.show_frame : !is_in(coded.slot_decode_index, *other);
+    if (!other->is_chained() && is_output) {
+      last_display_ = std::max(last_display_, other->motion.display_index);
+    }
   }
+  chain_up_to(last_display_);
   release_frames(coded.slot_decode_index);
 }
 
@@ -146,10 +157,7 @@ void TrackBuilder::seed(ChainedFrame& frame) const {
 // Releases the frames to which no later frame can be linked.
 void TrackBuilder::release_frames(std::span<const std::int32_t> slots) {
   const auto is_needed = [&](const ChainedFrame& frame) {
-    if (!frame.is_chained()) return true;
-    if (std::find(slots.begin(), slots.end(), frame.motion.decode_index) != slots.end()) {
-      return true;
-    }
+    if (!frame.is_chained() || is_in(slots, frame)) return true;
     return std::any_of(frames_.begin(), frames_.end(), [&](const auto& other) {
       return !other->is_chained() && (leads_to(other->motion, frame.motion, options_) ||
                                       leads_to(frame.motion, other->motion, options_));

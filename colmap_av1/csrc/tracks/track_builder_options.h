@@ -25,11 +25,11 @@ struct TrackBuilderOptions {
   int cells = 1;  // along either side of a unit
   // Number of cells along either side of a square in which a track starts; a divisor of 2 * cells.
   int seeding = 1;
-  // Display indices of the frames whose observations are kept; without a value, all frames.
-  std::optional<std::vector<std::int32_t>> observed;
-  // Of one in this many tracks, the first and the last observation in any shown frame are kept as
-  // well, whichever frames are observed; 0: of none.
-  int ends_of = 0;
+  // Display indices of the frames whose observations are stored; without a value, all frames.
+  std::optional<std::vector<std::int32_t>> stored_frames;
+  // One in this many tracks, chosen by a hash, is sampled: it also stores its first and last
+  // observation in any shown frame. 0: none.
+  int tracks_per_sample = 0;
 
   bool is_within_reach(int interval) const {
     return !max_interval || std::abs(interval) <= *max_interval;

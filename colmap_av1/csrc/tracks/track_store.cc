@@ -8,13 +8,15 @@
 namespace colmap_av1::tracks {
 
 TrackStore::TrackStore(const TrackBuilderOptions& options)
-    : min_length_(options.min_length), observed_(options.observed), ends_of_(options.ends_of) {
-  if (observed_) std::sort(observed_->begin(), observed_->end());
+    : min_length_(options.min_length),
+      stored_frames_(options.stored_frames),
+      tracks_per_sample_(options.tracks_per_sample) {
+  if (stored_frames_) std::ranges::sort(*stored_frames_);
 }
 
-bool TrackStore::is_observed(const ChainedFrame& frame) const {
-  return !observed_ ||
-         std::binary_search(observed_->begin(), observed_->end(), frame.motion.display_index);
+bool TrackStore::stores(const ChainedFrame& frame) const {
+  return !stored_frames_ ||
+         std::ranges::binary_search(*stored_frames_, frame.motion.display_index);
 }
 
 void TrackStore::set_size(int width, int height) {
@@ -28,7 +30,7 @@ std::int32_t TrackStore::start(ChainedFrame& frame, std::size_t cell) {
     tracks_.emplace_back();
     last_seen_.emplace_back();
     serials_.emplace_back();
-    if (ends_of_ > 0) ends_.emplace_back();
+    if (tracks_per_sample_ > 0) ends_.emplace_back();
   } else {
     index = free_tracks_.back();
     free_tracks_.pop_back();
@@ -39,25 +41,25 @@ std::int32_t TrackStore::start(ChainedFrame& frame, std::size_t cell) {
   Track& track = tracks_[index];
   track.frames = 1;
   frame.cells[cell].track = index;
-  if (frame.is_shown()) count(index, frame, frame.cells[cell], is_observed(frame));
+  if (frame.is_shown()) count(index, frame, frame.cells[cell], stores(frame));
   return index;
 }
 
 void TrackStore::observe(const ChainedFrame& frame) {
-  const bool is_kept = is_observed(frame);
+  const bool is_stored = stores(frame);
   for (const Cell& cell : frame.cells) {
-    if (cell.track >= 0) count(cell.track, frame, cell, is_kept);
+    if (cell.track >= 0) count(cell.track, frame, cell, is_stored);
   }
 }
 
 void TrackStore::count(std::int32_t index, const ChainedFrame& frame, const Cell& cell,
-                       bool is_observed) {
+                       bool is_stored) {
   Track& track = tracks_[index];
   ++track.length;
   const bool is_end = has_ends(index);
-  if (!is_observed && !is_end) return;
+  if (!is_stored && !is_end) return;
   const Observation seen = observation(frame, cell);
-  if (is_observed) record(track, seen);
+  if (is_stored) store(track, seen);
   if (!is_end) return;
   if (track.length == 1) ends_[index].first = seen;
   ends_[index].last = seen;
@@ -72,30 +74,30 @@ TrackStore::Observation TrackStore::observation(const ChainedFrame& frame,
           std::sqrt(cell.variance) * scale_y};
 }
 
-void TrackStore::record(Track& track, const Observation& observation) {
-  const int place = track.observed % kStretch;
-  if (place == 0) start_stretch(track);
-  stretches_[track.last_stretch].observations[place] = observation;
-  ++track.observed;
+void TrackStore::store(Track& track, const Observation& observation) {
+  const int place = track.num_stored % kChunkSize;
+  if (place == 0) start_chunk(track);
+  chunks_[track.last_chunk].observations[place] = observation;
+  ++track.num_stored;
 }
 
-void TrackStore::start_stretch(Track& track) {
-  auto index = static_cast<std::int32_t>(previous_stretch_.size());
-  if (!free_stretches_.empty()) {
-    index = free_stretches_.back();
-    free_stretches_.pop_back();
-  } else if (stretches_.size() < std::numeric_limits<std::int32_t>::max()) {
-    stretches_.emplace_back();
-    previous_stretch_.push_back(-1);
+void TrackStore::start_chunk(Track& track) {
+  auto index = static_cast<std::int32_t>(previous_chunk_.size());
+  if (!free_chunks_.empty()) {
+    index = free_chunks_.back();
+    free_chunks_.pop_back();
+  } else if (chunks_.size() < std::numeric_limits<std::int32_t>::max()) {
+    chunks_.emplace_back();
+    previous_chunk_.push_back(-1);
   } else {
     throw std::length_error("too many observations at a time: cut the video");
   }
-  previous_stretch_[index] = track.last_stretch;
-  track.last_stretch = index;
+  previous_chunk_[index] = track.last_chunk;
+  track.last_chunk = index;
 }
 
 void TrackStore::release(ChainedFrame& frame) {
-  const int least_observed = observed_ ? 2 : 1;
+  const int min_stored = stored_frames_ ? 2 : 1;
   for (std::size_t i = 0; i < frame.cells.size(); ++i) {
     const Cell& cell = frame.cells[i];
     if (cell.track == kSeed && length(frame, cell) >= min_length_) start(frame, i);
@@ -104,14 +106,14 @@ void TrackStore::release(ChainedFrame& frame) {
     if (--track.frames > 0) continue;
     free_tracks_.push_back(cell.track);
     if (track.length >= min_length_) {
-      if (track.observed >= least_observed) keep(cell.track);
+      if (track.num_stored >= min_stored) keep(cell.track);
       if (has_ends(cell.track)) {
         ends_[cell.track].serial = serials_[cell.track];
         kept_ends_.push_back(ends_[cell.track]);
       }
     }
-    for (std::int32_t s = track.last_stretch; s >= 0; s = previous_stretch_[s]) {
-      free_stretches_.push_back(s);
+    for (std::int32_t s = track.last_chunk; s >= 0; s = previous_chunk_[s]) {
+      free_chunks_.push_back(s);
     }
   }
 }
@@ -119,22 +121,22 @@ void TrackStore::release(ChainedFrame& frame) {
 void TrackStore::keep(std::int32_t index) {
   const Track& track = tracks_[index];
   const auto first = static_cast<std::ptrdiff_t>(done_.frame.size());
-  kept_.push_back({serials_[index], first, track.observed});
-  const std::size_t size = done_.frame.size() + static_cast<std::size_t>(track.observed);
+  kept_.push_back({serials_[index], first, track.num_stored});
+  const std::size_t size = done_.frame.size() + static_cast<std::size_t>(track.num_stored);
   done_.frame.resize(size);
   done_.xy.resize(2 * size);
   done_.sigma.resize(size);
   auto frame = done_.frame.end();
   auto xy = done_.xy.end();
   auto sigma = done_.sigma.end();
-  std::int32_t stretch = track.last_stretch;
-  for (int i = track.observed - 1; i >= 0; --i) {
-    const Observation& observation = stretches_[stretch].observations[i % kStretch];
+  std::int32_t chunk = track.last_chunk;
+  for (int i = track.num_stored - 1; i >= 0; --i) {
+    const Observation& observation = chunks_[chunk].observations[i % kChunkSize];
     *--frame = observation.frame;
     *--xy = observation.position.y;
     *--xy = observation.position.x;
     *--sigma = observation.sigma;
-    if (i % kStretch == 0) stretch = previous_stretch_[stretch];
+    if (i % kChunkSize == 0) chunk = previous_chunk_[chunk];
   }
 }
 
@@ -142,7 +144,7 @@ TrackArrays TrackStore::finish() {
   std::sort(kept_.begin(), kept_.end(),
             [](const Kept& a, const Kept& b) { return a.serial < b.serial; });
   tracks_.clear();
-  stretches_.clear();
+  chunks_.clear();
   TrackArrays out;
   out.width = width_;
   out.height = height_;

@@ -24,17 +24,17 @@ struct TrackArrays {
   std::vector<float> sigma;
 };
 
-// Holds the observations, in the observed frames, of tracks that are alive or long enough.
+// Stores the observations of tracks that are alive or kept, in all shown frames or in some of them.
 class TrackStore {
  public:
-  // With `observed` frames, a track that is observed in only one of them is not kept.
+  // With `stored_frames`, a track with fewer than two stored observations is not kept.
   explicit TrackStore(const TrackBuilderOptions& options);
 
   // Size of the pictures in whose pixels positions are given.
   void set_size(int width, int height);
   bool has_size() const { return width_ != 0; }
 
-  // Number of shown frames in which a cell's track has been observed.
+  // Number of shown frames in which a cell's track has been observed, stored or not.
   std::int32_t length(const ChainedFrame& frame, const Cell& cell) const {
     if (cell.track == kSeed) return frame.is_shown() ? 1 : 0;
     return tracks_[cell.track].length;
@@ -51,7 +51,8 @@ class TrackStore {
     last_seen_[track] = frame.order;
     ++tracks_[track].frames;
   }
-  // Adds observations of all tracks that a shown frame holds.
+  // Counts an observation of each track that a shown frame holds, and stores it if the frame is one
+  // of those.
   void observe(const ChainedFrame& frame);
   // Releases a frame. A track that no frame holds any more ends.
   void release(ChainedFrame& frame);
@@ -66,10 +67,10 @@ class TrackStore {
  private:
   // Kept small, because tracks are accessed often and in random order.
   struct Track {
-    std::int32_t last_stretch = -1;
-    std::int32_t length = 0;    // number of shown frames with an observation
-    std::int32_t observed = 0;  // number of observations that are kept
-    std::int32_t frames = 0;    // number of frames that hold it
+    std::int32_t last_chunk = -1;
+    std::int32_t length = 0;      // number of shown frames in which it is observed
+    std::int32_t num_stored = 0;  // number of stored observations
+    std::int32_t frames = 0;      // number of frames that hold it
   };
   struct Observation {
     std::int32_t frame = 0;
@@ -77,9 +78,9 @@ class TrackStore {
     float sigma = 0.F;
   };
   // Some observations of a live track, in one cache line.
-  static constexpr int kStretch = 4;
-  struct alignas(64) Stretch {
-    std::array<Observation, kStretch> observations;
+  static constexpr int kChunkSize = 4;
+  struct alignas(64) Chunk {
+    std::array<Observation, kChunkSize> observations;
   };
   // Observations of finished tracks. A deque grows without copying.
   struct Done {
@@ -99,24 +100,24 @@ class TrackStore {
     Observation last;
   };
 
-  // Counts an observation of a track in a shown frame, and keeps it if the frame `is_observed`.
-  void count(std::int32_t index, const ChainedFrame& frame, const Cell& cell, bool is_observed);
-  void record(Track& track, const Observation& observation);
+  // Counts an observation of a track in a shown frame, and stores it if `is_stored`.
+  void count(std::int32_t index, const ChainedFrame& frame, const Cell& cell, bool is_stored);
+  void store(Track& track, const Observation& observation);
   Observation observation(const ChainedFrame& frame, const Cell& cell) const;
-  bool is_observed(const ChainedFrame& frame) const;
+  bool stores(const ChainedFrame& frame) const;
   bool has_ends(std::int32_t index) const {
-    if (ends_of_ == 0) return false;
+    if (tracks_per_sample_ == 0) return false;
     // Fibonacci hashing: a modulus of the serial numbers, which count cells, would choose whole
     // columns of the grid of seeds.
     const auto hash = static_cast<std::uint64_t>(serials_[index]) * 0x9E3779B97F4A7C15U >> 32U;
-    return hash % static_cast<std::uint64_t>(ends_of_) == 0;
+    return hash % static_cast<std::uint64_t>(tracks_per_sample_) == 0;
   }
-  void start_stretch(Track& track);
+  void start_chunk(Track& track);
   void keep(std::int32_t index);
 
   int min_length_;
-  std::optional<std::vector<std::int32_t>> observed_;  // ascending
-  int ends_of_;
+  std::optional<std::vector<std::int32_t>> stored_frames_;  // ascending
+  int tracks_per_sample_;
   int width_ = 0;
   int height_ = 0;
   std::vector<Track> tracks_;
@@ -124,9 +125,9 @@ class TrackStore {
   std::vector<std::int64_t> serials_;    // serial numbers of the tracks' seeds
   std::vector<Ends> ends_;               // of the tracks that have ends
   std::vector<std::int32_t> free_tracks_;
-  std::deque<Stretch> stretches_;
-  std::vector<std::int32_t> previous_stretch_;  // by stretch, the previous one of the same track
-  std::vector<std::int32_t> free_stretches_;
+  std::deque<Chunk> chunks_;
+  std::vector<std::int32_t> previous_chunk_;  // by chunk, the previous one of the same track
+  std::vector<std::int32_t> free_chunks_;
   std::vector<Kept> kept_;  // in the order in which they ended, like their observations
   Done done_;
   std::vector<Ends> kept_ends_;
