@@ -95,12 +95,12 @@ def read_motion(
     display_index: dict[int, int] = {}
     for number, decode_index in enumerate(index.shown):
         display_index.setdefault(decode_index, number)
-    count = num_irregular = 0
+    count = num_wrong = 0
     try:
         for event in _read_events(video, options, index):
             if event.is_repeated:
                 continue
-            num_irregular += event.num_wrong_trailing_bits > 0
+            num_wrong += event.num_wrong_trailing_bits > 0
             yield _frame_motion(event, display_index)
             count += 1
     except BitstreamError as error:
@@ -109,9 +109,9 @@ def read_motion(
         if count == 0:
             raise BitstreamError(f"{error}: no frame can be read: give another copy") from error
         warnings.warn(f"{error}; the {count} frames before the damage are used", stacklevel=2)
-    if num_irregular:
+    if num_wrong:
         warnings.warn(
-            f"{video}: {num_irregular} of {count} frames have tiles that do not end with the bits "
+            f"{video}: {num_wrong} of {count} frames have tiles that do not end with the bits "
             "the specification requires; they are read as decoders read them",
             stacklevel=2,
         )

@@ -52,12 +52,13 @@ def refine_tracks(
 ) -> Tracks:
     """Correct track positions by Lucas-Kanade on the decoded pictures.
 
-    Every track has a template, which is the picture around an earlier observation. An observation
-    is searched for near the position to which the step in the bitstream leads: first with the
-    template, which does not drift, then with the picture around the previous observation. If only
-    the second search finds it, it becomes the new template. If neither finds it, it keeps the
-    bitstream's step and its larger expected error, and is not marked as confirmed. No observation
-    is removed.
+    A track whose first picture has texture gets a template, which is the picture around an earlier
+    observation. An observation is searched for near the position to which the step in the bitstream
+    leads: first with the template, which does not drift, then with the picture around the previous
+    observation. If only the second search finds it, it becomes the new template. If neither finds
+    it, it keeps the bitstream's step and its larger expected error, and is not marked as confirmed.
+    So do all observations of a track without a template: templates that begin later are less
+    accurate. No observation is removed.
 
     Frames are consumed one by one. In addition to the tracks, memory holds two pictures and one
     template for each track of a frame.
@@ -150,7 +151,7 @@ class RefinedTracks:
     track: NDArray[np.int64]  # of each observation
     is_first: NDArray[np.bool_]
     is_last: NDArray[np.bool_]
-    shown: NDArray[np.bool_]  # observed or found, so that the picture there shows the track
+    is_located: NDArray[np.bool_]  # observed or found, so that the picture there shows the track
     step: NDArray[np.float32]  # the bitstream's motion from the previous observation
     step_variance: NDArray[np.float64]
     bitstream_variance: NDArray[np.float64]
@@ -182,7 +183,7 @@ class RefinedTracks:
             track=tracks.track,
             is_first=is_first,
             is_last=is_last,
-            shown=np.ones(num_observations, np.bool_) if expected is None else ~expected,
+            is_located=np.ones(num_observations, np.bool_) if expected is None else ~expected,
             step=np.diff(tracks.xy, axis=0, prepend=np.zeros((1, 2), np.float32)),
             step_variance=step_variance,
             bitstream_variance=variance,
@@ -228,7 +229,6 @@ class RefinedTracks:
     def refine(self, seen: NDArray[np.int64], image: NDArray[np.uint8]) -> None:
         """Correct the observations in the frame whose picture is `image`."""
         frame = int(self.tracks.frame[seen[0]]) if len(seen) else -1
-        self.templates.drop(self.track[seen[self.is_last[seen] & self.is_first[seen]]])
         later = seen[~self.is_first[seen]]
         self._follow(later)
         templates = self.templates
@@ -238,7 +238,12 @@ class RefinedTracks:
         tracked = later[templates.slot[self.track[later]] >= 0]
         track = self.track[tracked]
         found = _match(
-            templates.atlas, canvas, templates.point[track], self.xy[tracked], self.options
+            templates.atlas,
+            canvas,
+            templates.point[track],
+            self.xy[tracked],
+            size=image.shape[::-1],
+            options=self.options,
         )
         sure = self.accept(tracked, found, templates.source[track])
         templates.misses[track[sure]] = 0
@@ -248,17 +253,24 @@ class RefinedTracks:
         lost = tracked[~sure]
         fresh = np.empty(0, dtype=np.int64)
         if self.last_image is not None:
-            lost = lost[(self.tracks.frame[lost - 1] == self.last_frame) & self.shown[lost - 1]]
+            lost = lost[
+                (self.tracks.frame[lost - 1] == self.last_frame) & self.is_located[lost - 1]
+            ]
             track = self.track[lost]
             found = _match(
-                self.last_image, image, self.xy[lost - 1] - 0.5, self.xy[lost], self.options
+                self.last_image,
+                image,
+                self.xy[lost - 1] - 0.5,
+                self.xy[lost],
+                size=image.shape[::-1],
+                options=self.options,
             )
             sure = self.accept(lost, found, lost - 1)
             fresh = lost[sure]
             self.variance[lost[~sure]] += _REFUSED_SIGMA**2
 
         given_up = tracked[templates.misses[self.track[tracked]] > _MAX_MISSES]
-        given_up = given_up[self.shown[given_up]]
+        given_up = given_up[self.is_located[given_up]]
         renewed = np.concatenate([seen[self.is_first[seen]], np.union1d(fresh, given_up)])
         renewed = renewed[~self.is_last[renewed]]
         templates.drop(self.track[seen[self.is_last[seen]]])
@@ -295,7 +307,7 @@ class RefinedTracks:
         since = self.bitstream_variance[taken] - self.bitstream_variance[source[sure]]
         self.variance[taken] = self.variance[source[sure]] + _match_variance(noise, since)
         self.confirmed[taken] = True
-        self.shown[taken] = True
+        self.is_located[taken] = True
         return sure
 
 
@@ -397,15 +409,18 @@ def _match(
     target: NDArray[np.uint8],
     point: NDArray[np.float32],
     expected: NDArray[np.float32],
+    *,
+    size: tuple[int, ...],
     options: RefineOptions,
 ) -> _Matches:
     """Search `target` near expected positions for what `source` shows at some points.
 
     Args:
         source: picture with the points.
-        target: picture of the same size.
+        target: picture of the same size, which may have a margin on the right and at the bottom.
         point: float32 [n, 2] in source; the first pixel's centre is (0, 0).
         expected: float32 [n, 2] in target; the origin is the picture's corner.
+        size: (width, height) of the target without its margin.
         options: window size and largest correction.
     """
     if len(point) == 0:
@@ -424,8 +439,9 @@ def _match(
     ok = (seen.ravel() == 1) & (seen_back.ravel() == 1)
     ok &= np.abs(back - point).max(axis=1) <= _MAX_RETURN
     ok &= np.abs(found - start).max(axis=1) <= options.refine_move
-    ok &= ((found >= 0) & (found < target.shape[::-1])).all(axis=1)
-    return _Matches(ok, found + np.float32(0.5), np.where(ok, difference.ravel(), np.inf))
+    found += np.float32(0.5)
+    ok &= ((found >= 0) & (found < size)).all(axis=1)
+    return _Matches(ok, found, np.where(ok, difference.ravel(), np.inf))
 
 
 def _match_variance(noise: NDArray[np.float32], prior: NDArray[np.float64]) -> NDArray[np.float64]:

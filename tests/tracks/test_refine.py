@@ -117,6 +117,36 @@ def test_wrong_step_is_not_confirmed() -> None:
     assert np.median(error[textured & ~off]) < 0.06
 
 
+def test_positions_that_leave_the_picture_are_not_confirmed() -> None:
+    # A texture moves down by a pixel per frame, and tracks near the bottom leave the picture.
+    width, height, count = 320, 60, 14
+    noise = np.random.default_rng(1).integers(0, 256, (400, 400)).astype(np.float32)
+    scene = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX)
+    frames = [
+        (i, scene[100 - i : 100 - i + height, 40 : 40 + width].astype(np.uint8))
+        for i in range(count)
+    ]
+    start = np.arange(8, 310, 2, dtype=np.float32)
+    xy = np.empty((len(start), count, 2), np.float32)
+    xy[..., 0] = start[:, None]
+    xy[..., 1] = np.minimum(height - 9 + np.arange(count), height)
+    number = len(start) * count
+    tracks = Tracks(
+        num_frames=count,
+        width=width,
+        height=height,
+        offsets=np.arange(0, number + 1, count),
+        frame=np.tile(np.arange(count, dtype=np.int32), len(start)),
+        xy=xy.reshape(-1, 2),
+        sigma=np.tile(np.linspace(0, 0.5, count, dtype=np.float32), len(start)),
+        confirmed=np.zeros(number, np.bool_),
+    )
+    refined = refine_tracks(tracks, frames, RefineOptions(refine="lk"))
+    confirmed = refined.xy[refined.confirmed]
+    assert len(confirmed) > len(start)
+    assert confirmed[:, 1].max() < height
+
+
 def test_tracks_in_missing_frames_keep_their_motion() -> None:
     tracks, truth = moving_tracks(0.3)
     shown = [frame for frame in pictures() if frame[0] not in (4, 5, FRAMES - 1)]

@@ -3,11 +3,13 @@
 #include <algorithm>
 
 #include "av1/spec_tables.h"
+#include "av1/subexp.h"
 
 namespace colmap_av1::av1 {
 namespace {
 
 constexpr int kAllFrames = (1 << NUM_REF_FRAMES) - 1;
+constexpr int kGmParamsK = 3;  // k of 5.9.27
 
 // 5.5.2 Color config syntax
 void read_color_config(BitReader& r, SequenceHeader& seq) {
@@ -104,7 +106,6 @@ class FrameHeaderReader {
   void skip_mode_params();
   void global_motion_params();
   void read_global_param(const GmParams& previous, int type, int ref, int idx);
-  int decode_signed_subexp_with_ref(int low, int high, int reference);
   void film_grain_params();
 };
 
@@ -696,32 +697,8 @@ void FrameHeaderReader::read_global_param(const GmParams& previous, int type, in
   const int mx = 1 << abs_bits;
   const int reference = (previous[ref][idx] >> prec_diff) - sub;
   h.gm_params[ref][idx] =
-      decode_signed_subexp_with_ref(-mx, mx + 1, reference) * (1 << prec_diff) + round;
-}
-
-// 5.9.26 to 5.9.29 Subexponential codes with a reference value
-int FrameHeaderReader::decode_signed_subexp_with_ref(int low, int high, int reference) {
-  const int mx = high - low;
-  const int rr = reference - low;
-  const auto decode_subexp = [&](int num_syms) {
-    int mk = 0;
-    const int k = 3;
-    for (int i = 0;; ++i) {
-      const int b2 = i ? k + i - 1 : k;
-      const int a = 1 << b2;
-      if (num_syms <= mk + 3 * a) return r.ns(num_syms - mk) + mk;
-      if (!r.flag()) return r.literal(b2) + mk;
-      mk += a;
-    }
-  };
-  const auto inverse_recenter = [](int center, int v) {
-    if (v > 2 * center) return v;
-    return v & 1 ? center - ((v + 1) >> 1) : center + (v >> 1);
-  };
-  const int v = decode_subexp(mx);
-  const int x =
-      (rr << 1) <= mx ? inverse_recenter(rr, v) : mx - 1 - inverse_recenter(mx - 1 - rr, v);
-  return x + low;
+      decode_signed_subexp_with_ref(r, -mx, mx + 1, kGmParamsK, reference) * (1 << prec_diff) +
+      round;
 }
 
 // 5.9.30 Film grain params syntax; the values do not affect parsing and are dropped

@@ -127,7 +127,7 @@ void TileParser::palette_tokens() {
 template <typename ReadIndex>
 void TileParser::read_color_map(int size, int width, int height, ReadIndex&& read_index) {
   constexpr int kStride = 64;
-  color_map_[0] = static_cast<std::uint8_t>(symbols_.non_symmetric(size));
+  color_map_[0] = static_cast<std::uint8_t>(symbols_.ns(size));
   for (int i = 1; i < height + width - 1; ++i) {
     for (int j = std::min(i, width - 1); j >= std::max(0, i - height + 1); --j) {
       std::uint8_t* at = &color_map_[(i - j) * kStride + j];

@@ -4,6 +4,7 @@
 
 #include "av1/error.h"
 #include "av1/spec_tables.h"
+#include "av1/subexp.h"
 #include "av1/tile_parser.h"
 
 namespace colmap_av1::av1 {
@@ -302,8 +303,8 @@ void TileParser::read_lr_unit(int plane) {
   if (restoration_type == RESTORE_WIENER) {
     for (auto& taps : ref_lr_wiener_[plane]) {
       for (int j = plane ? 1 : 0; j < WIENER_COEFFS; ++j) {
-        taps[j] = decode_signed_subexp_with_ref_bool(kWienerTapsMin[j], kWienerTapsMax[j] + 1,
-                                                     kWienerTapsK[j], taps[j]);
+        taps[j] = decode_signed_subexp_with_ref(symbols_, kWienerTapsMin[j],
+                                                kWienerTapsMax[j] + 1, kWienerTapsK[j], taps[j]);
       }
     }
   } else if (restoration_type == RESTORE_SGRPROJ) {
@@ -313,36 +314,14 @@ void TileParser::read_lr_unit(int plane) {
       const int max = kSgrprojXqdMax[i];
       int v = 0;
       if (kSgrParams[lr_sgr_set][i * 2]) {
-        v = decode_signed_subexp_with_ref_bool(min, max + 1, SGRPROJ_PRJ_SUBEXP_K,
-                                               ref_sgr_xqd_[plane][i]);
+        v = decode_signed_subexp_with_ref(symbols_, min, max + 1, SGRPROJ_PRJ_SUBEXP_K,
+                                          ref_sgr_xqd_[plane][i]);
       } else if (i == 1) {
         v = std::clamp((1 << SGRPROJ_PRJ_BITS) - ref_sgr_xqd_[plane][0], min, max);
       }
       ref_sgr_xqd_[plane][i] = v;
     }
   }
-}
-
-int TileParser::decode_signed_subexp_with_ref_bool(int low, int high, int k, int reference) {
-  const int mx = high - low;
-  const int r = reference - low;
-  const auto decode_subexp_bool = [&](int num_syms) {
-    int mk = 0;
-    for (int i = 0;; ++i) {
-      const int b2 = i ? k + i - 1 : k;
-      const int a = 1 << b2;
-      if (num_syms <= mk + 3 * a) return symbols_.non_symmetric(num_syms - mk) + mk;
-      if (!symbols_.bit()) return symbols_.literal(b2) + mk;
-      mk += a;
-    }
-  };
-  const auto inverse_recenter = [](int center, int v) {
-    if (v > 2 * center) return v;
-    return v & 1 ? center - ((v + 1) >> 1) : center + (v >> 1);
-  };
-  const int v = decode_subexp_bool(mx);
-  const int x = (r << 1) <= mx ? inverse_recenter(r, v) : mx - 1 - inverse_recenter(mx - 1 - r, v);
-  return x + low;
 }
 
 }  // namespace colmap_av1::av1

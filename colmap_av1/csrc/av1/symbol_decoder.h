@@ -120,7 +120,7 @@ class SymbolDecoder {
   }
 
   // NS(n)
-  int non_symmetric(int n) {
+  int ns(int n) {
     const int w = std::bit_width(static_cast<unsigned>(n));
     const int m = (1 << w) - n;
     const int v = literal(w - 1);

@@ -44,7 +44,6 @@ class TileParser {
   void read_delta_lf();
   void read_lr(int r, int c, int b_size);
   void read_lr_unit(int plane);
-  int decode_signed_subexp_with_ref_bool(int low, int high, int k, int reference);
 
   // mode_info.cc
   void intra_frame_mode_info();

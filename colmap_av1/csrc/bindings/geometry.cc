@@ -30,6 +30,7 @@ using Points = InputArray<double, nb::shape<-1, 3>>;
 using Pose = InputArray<double, nb::shape<3, 4>>;
 using Poses = InputArray<double, nb::shape<-1, 3, 4>>;
 using Pairs = InputArray<double, nb::shape<-1, 2>>;
+using Positions = InputArray<float, nb::shape<-1, 2>>;
 using Numbers = InputArray<double, nb::ndim<1>>;
 using Indices = InputArray<std::int64_t, nb::ndim<1>>;
 using Picture = InputArray<std::uint8_t, nb::ndim<2>>;
@@ -79,7 +80,7 @@ geometry::GreyPicture grey_picture(const Picture& pixels) {
           .height = static_cast<std::int64_t>(pixels.shape(0))};
 }
 
-nb::object correlate_patches(const Picture& one, const InputArray<float, nb::shape<-1, 2>>& at_one,
+nb::object correlate_patches(const Picture& one, const Positions& at_one,
                              const Picture& two,
                              const InputArray<float, nb::shape<-1, -1, 2>>& at_two,
                              float min_deviation) {
@@ -95,7 +96,6 @@ nb::object correlate_patches(const Picture& one, const InputArray<float, nb::sha
   return adopt<float>(std::move(found), {at_two.shape(0), at_two.shape(1)});
 }
 
-using Positions = InputArray<float, nb::shape<-1, 2>>;
 
 nb::tuple find_patches(const InputArray<std::uint8_t, nb::ndim<3>>& patches, const Indices& index,
                        const Positions& middle,

@@ -67,9 +67,9 @@ inline Projection project(const double* pose, const double* focal, double x, dou
   if (!(depth > 0)) return found;
   found.x = u / depth;
   found.y = v / depth;
-  const double off_x = (found.x - x) * focal[0];
-  const double off_y = (found.y - y) * focal[1];
-  const double error2 = off_x * off_x + off_y * off_y;
+  const double residual_x = (found.x - x) * focal[0];
+  const double residual_y = (found.y - y) * focal[1];
+  const double error2 = residual_x * residual_x + residual_y * residual_y;
   if (std::isfinite(error2)) found.error2 = error2;
   return found;
 }
@@ -82,12 +82,12 @@ double widest_angle(std::size_t count, const RayOf& ray_of) {
   if (count == 0) return 0;
   const Vector first = ray_of(0);
   const Vector last = ray_of(count - 1);
-  double narrowest = 1.0;
+  double min_cosine = 1.0;
   for (std::size_t i = 0; i < count; ++i) {
     const Vector own = ray_of(i);
-    narrowest = std::min({narrowest, dot(own, first), dot(own, last)});
+    min_cosine = std::min({min_cosine, dot(own, first), dot(own, last)});
   }
-  return std::acos(std::clamp(narrowest, -1.0, 1.0));
+  return std::acos(std::clamp(min_cosine, -1.0, 1.0));
 }
 
 }  // namespace colmap_av1::geometry

@@ -29,7 +29,7 @@ class Chainer {
   // The position that a track would get by a cell's displacement, and how well it fits.
   struct Claim {
     std::int32_t cell = -1;  // in the frame that has the displacement
-    float cost = 0.F;        // distance from the claiming cell's centre, in coded pixels
+    float cost = 0.F;        // distance of `position` from the centre of its cell, in coded pixels
     Point position;          // in the current frame, coded pixels
     Point velocity;
     float variance = 0.F;
@@ -89,7 +89,8 @@ class Chainer {
   ChainedFrame* current_ = nullptr;
   TrackStore* store_ = nullptr;
   // Buffers that are reused for every frame.
-  std::vector<Claim> claims_;          // by cell; all empty between links
+  // By cell of the link's frame without the displacement; all empty between links.
+  std::vector<Claim> claims_;
   std::vector<std::int32_t> claimed_;  // cells with a claim
   std::vector<OpenUnit> open_units_;   // of the current frame, in raster order
   // For a frame with tracks: the cells whose tracks are not yet continued into the current frame,
