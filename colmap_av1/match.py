@@ -45,12 +45,14 @@ from colmap_av1.matching.match_images import (
 )
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter
 from colmap_av1.options import (
+    DensifyOptions,
     ImageOptions,
     MapOptions,
     MatchOptions,
     PairOptions,
     ReconstructOptions,
 )
+from colmap_av1.options.fields import Options
 from colmap_av1.options.words import words_of
 from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
 from colmap_av1.poses.run import Run
@@ -60,7 +62,7 @@ from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import least_length
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.cpus import one_blas_thread
-from colmap_av1.util.files import scratch_folder
+from colmap_av1.util.files import check_outside, scratch_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.kept_pictures import KeptPictures
@@ -81,6 +83,7 @@ class MatchReport:
         conversion: how videos were converted, in words; None if all are AV1.
         photos: folder of the photos; None if none was given.
         image_path: folder of the images; None if none was given.
+        densify_options: options with which `densify` reads the videos, masks and images alike.
         num_frames: shown frames of the videos.
         num_coded_frames: coded frames, including hidden ones.
         num_images: images of the database.
@@ -121,6 +124,7 @@ class MatchReport:
     conversion: str | None
     photos: Path | None
     image_path: Path | None
+    densify_options: DensifyOptions
     num_frames: int
     num_coded_frames: int
     num_images: int
@@ -184,7 +188,7 @@ class MatchReport:
             "--database", database,
             "--image_path", images,
             "--output", output,
-            *(part for word in words_of(self.map_options) for part in word.split("=")),
+            *_words_of(self.map_options),
         ]
         densify = [
             "colmap-av1", "densify",
@@ -192,6 +196,7 @@ class MatchReport:
             *(word for video in self.videos for word in ("--video", _path_word(video))),
             *(("--photos", _path_word(self.photos)) if self.photos is not None else ()),
             *(("--image_path", images) if self.image_path is not None else ()),
+            *_words_of(self.densify_options),
             "--output", _path_word(self.database.with_name(f"{self.database.stem}_splats")),
         ]
         # fmt: on
@@ -252,11 +257,13 @@ def match(
     database = Path(database)
     folder = Path(image_path) if image_path is not None else None
     clock = Clock()
+    given = options
 
     before = files_in(folder) if folder is not None else set[Path]()
     listed = _read_listed_images(database, options)
     inputs = read_inputs(video, photos, options)
     if folder is not None:
+        check_outside(folder, photos)
         check_places(inputs.photos, folder)
     context = RunContext.of(options.run, clock, progress)
     with unchanged(*inputs.states) as check_videos, ExitStack() as opened:
@@ -339,6 +346,7 @@ def match(
         conversion=inputs.conversion([own.source.conversion for own in videos]),
         photos=Path(photos) if photos is not None else None,
         image_path=folder,
+        densify_options=_densify_options(given, named=folder is None and not listed),
         num_frames=images.image_set.num_frames - len(inputs.photos),
         num_coded_frames=sum(own.tracked.video.num_coded_frames for own in videos),
         num_images=len(written.keypoints),
@@ -664,6 +672,33 @@ def _length_quantiles(lengths: NDArray[np.int64]) -> dict[float, int]:
         return {}
     found = np.quantile(lengths, _LENGTH_QUANTILES, method="lower")
     return dict(zip(_LENGTH_QUANTILES, map(int, found), strict=True))
+
+
+def _densify_options(given: MatchOptions, *, named: bool) -> DensifyOptions:
+    """Options of `densify` on the same videos.
+
+    Args:
+        given: the options of this run.
+        named: whether this run chose the names of images that do not exist as files.
+    """
+    images, first = given.images, given.images.first_number
+    if named and images.frame_list is None:
+        first = 0  # see `ImageOptions.image_name`
+    return DensifyOptions(
+        match=MatchOptions(
+            images=ImageOptions(frame_list=images.frame_list, first_number=first),
+            masks=given.masks,
+            encode=given.encode,
+            read=given.read,
+            keep_stream=given.keep_stream,
+            reencode=given.reencode,
+        )
+    )
+
+
+def _words_of(options: Options) -> list[str]:
+    """The options as words, each value after the name of its option."""
+    return [part for word in words_of(options) for part in word.split("=", 1)]
 
 
 def _path_word(path: Path) -> str:

@@ -38,7 +38,7 @@ from colmap_av1.splats.reconstruct_model import ModelResult
 from colmap_av1.splats.reconstruct_models import FurtherModel, further_models, written_model
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.cpus import one_blas_thread
-from colmap_av1.util.files import check_apart, scratch_folder, whole_file
+from colmap_av1.util.files import check_apart, check_outside, scratch_folder, whole_file
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import open_stages
@@ -209,6 +209,7 @@ def reconstruct(
     output = Path(output)
     clock = Clock()
     check_apart(output, [*paths_of(video), photos, *options.match.files])
+    check_outside(output, photos)
     inputs = read_inputs(video, photos, options.match, flat=True)
     # Invalid input is refused before the long work.
     checked = [*(own.path for own in inputs.videos), *options.match.files]

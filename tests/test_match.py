@@ -38,7 +38,7 @@ from colmap_av1.errors import (
     OptionError,
     VideoError,
 )
-from colmap_av1.images.files import alone_in, write_images
+from colmap_av1.images.files import alone_in, write_image, write_images
 from colmap_av1.images.names import image_names
 from colmap_av1.map import map_database
 from colmap_av1.match import match
@@ -47,6 +47,7 @@ from colmap_av1.options import (
     DensityOptions,
     ImageOptions,
     LinkOptions,
+    MaskOptions,
     MatchOptions,
     PairOptions,
     ReadOptions,
@@ -604,3 +605,16 @@ def test_forward_motion_is_detected(street: Street, clip: Path, tmp_path: Path) 
     with_colmap, ours, _ = report.next_commands
     assert "--Mapper.init_min_tri_angle 4" in with_colmap
     assert "--init_min_tri_angle 4" in ours
+
+
+def test_printed_command_densifies_the_same_frames_and_masks(clip: Path, tmp_path: Path) -> None:
+    write_image(tmp_path / "mask.png", np.full((128, 192, 3), 255, np.uint8))
+    options = MatchOptions(
+        masks=MaskOptions(tmp_path / "mask.png"), keep_stream=tmp_path / "kept.mp4"
+    )
+    of_names = match(tmp_path / "a.db", clip, options=options).next_commands[2]
+    of_images = match(tmp_path / "b.db", clip, image_path=tmp_path / "images").next_commands[2]
+    assert "--first_number 0" in of_names
+    assert f"--mask_path {tmp_path / 'mask.png'}" in of_names
+    assert f"--keep_stream {tmp_path / 'kept.mp4'}" in of_names
+    assert "--first_number" not in of_images

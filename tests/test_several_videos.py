@@ -252,6 +252,18 @@ def test_another_file_with_the_name_of_a_photo_is_kept(
     assert mine.read_bytes() == b"mine"
 
 
+def test_outputs_among_the_photos_are_refused(
+    halves: tuple[Path, Path], photos: Path, tmp_path: Path
+) -> None:
+    album = Path(shutil.copytree(photos, tmp_path / "album"))
+    with pytest.raises(OptionError, match="album"):
+        match(tmp_path / "a.db", halves[0], photos=album, image_path=album / "images")
+    with pytest.raises(OptionError, match="album"):
+        reconstruct(halves[0], album / "out", photos=album)
+    assert not (tmp_path / "a.db").exists()
+    assert not (album / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -21,7 +21,6 @@ from colmap_av1.cli.report_file import write_report_json
 from colmap_av1.cli.terminal import (
     print_next,
     print_result,
-    print_summary,
     print_text,
     print_warning,
     progress_bars,
@@ -113,11 +112,10 @@ def _flag(name: str, what: str) -> Argument:
 
 
 def _videos(what: str) -> tuple[Argument, ...]:
-    """Options for videos and photos; help does not show --images, another name of --photos."""
+    """Options for videos and photos."""
     return (
         _path("video", f"{what}; repeat for several videos", action="append"),
         _optional_path("photos", "folder of photos of the same scene to add"),
-        Argument(("--images",), {"dest": "photos", "help": argparse.SUPPRESS}),
     )
 
 
@@ -269,7 +267,7 @@ def _info(namespace: argparse.Namespace) -> None:
     # A text says why it is not observable.
     found = read_out if read_out is None or isinstance(read_out, str) else asdict(read_out)
     write_report_json(namespace, result, read_out=found)
-    print_summary([*reports.info_rows(result), *reports.read_out_rows(read_out)])
+    print_result(namespace, [*reports.info_rows(result), *reports.read_out_rows(read_out)])
 
 
 def _check(namespace: argparse.Namespace) -> int:

@@ -136,9 +136,8 @@ def _add_option(
     )
     if not declared.common:
         command.rare.append(action)
-    if options.colmap_prefix:  # accepted, but not shown in help
-        prefixed = (f"--{options.colmap_prefix}.{name}" for name in names)
-        command.add_argument(*prefixed, help=argparse.SUPPRESS, **how)
+    if declared.colmap:  # accepted, but not shown in help
+        command.add_argument(f"--{declared.colmap}", help=argparse.SUPPRESS, **how)
 
 
 def _with_given(options: _Options, name: str, values: dict[str, Any]) -> _Options:

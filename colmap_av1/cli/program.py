@@ -27,8 +27,8 @@ from colmap_av1.util.cpus import BLAS_THREADS
 from colmap_av1.util.signals import ending_in_order, handlers_kept, held_back
 
 _ABOUT_NAMES = (
-    "'-' and '_' are equivalent in option names. COLMAP's spellings are accepted, such as "
-    "--ImageReader.camera_model."
+    "'-' and '_' are equivalent in option names. COLMAP's names of these options are accepted as "
+    "well, such as --database_path and --ImageReader.camera_model."
 )
 _EXAMPLES = f"""\
 examples:

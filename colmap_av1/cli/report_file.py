@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,9 @@ from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.files import check_creatable, whole_file
 from colmap_av1.util.plain import plain
+
+# Options that name the outputs of commands.
+_OUTPUTS = ("database", "output", "gaussians", "keep_stream")
 
 
 def write_report_json(namespace: argparse.Namespace, report: Any, **others: Any) -> None:
@@ -45,7 +48,8 @@ def failure_as_json(namespace: argparse.Namespace) -> Iterator[None]:
     """
     path = getattr(namespace, "report_json", None)
     if path is not None:
-        _check_report(Path(path))
+        given = vars(namespace).items()
+        _check_report(Path(path), [v for k, v in given if k.rpartition(".")[2] in _OUTPUTS])
     try:
         yield
     except Exception as error:
@@ -58,13 +62,17 @@ def failure_as_json(namespace: argparse.Namespace) -> Iterator[None]:
         raise
 
 
-def _check_report(path: Path) -> None:
+def _check_report(path: Path, outputs: Iterable[str | None]) -> None:
     """Check that a report can be written to a file, which it may create or replace.
 
     Raises:
-        OptionError: the file cannot be created, or exists and is not a report.
+        OptionError: the file cannot be created, exists and is not a report, or is one of the
+            `outputs` of the command or in one of them.
     """
     check_creatable(path)
+    for output in outputs:
+        if output is not None and path.resolve().is_relative_to(Path(output).resolve()):
+            raise OptionError(f"{path}: is or is in the output {output}: give another file")
     if not os.path.lexists(path):
         return
     found: object = None

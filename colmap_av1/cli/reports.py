@@ -33,7 +33,8 @@ _SAME_FOCAL_LENGTH = 1e-4
 
 def match_rows(report: MatchReport) -> Rows:
     """What `match` wrote."""
-    lengths = {f"{q:.0%}": length for q, length in report.track_lengths.items()}
+    names = {0.0: "shortest", 0.5: "median", 1.0: "longest"}
+    lengths = [f"{names[q]} {n}" for q, n in report.track_lengths.items() if q in names]
     images = max(report.num_images, 1)
     inlier_share = report.num_inliers / max(report.num_matches, 1)
     rows = [
@@ -45,7 +46,7 @@ def match_rows(report: MatchReport) -> Rows:
         *_mask_row(report.masked),
         *_shutter_row(report.read_outs),
         ("tracks", str(report.num_tracks)),
-        ("track lengths", ", ".join(f"{q} {length}" for q, length in lengths.items())),
+        ("images per track", ", ".join(lengths)),
         (
             "keypoints",
             f"{report.num_observations}, {report.num_observations / images:.0f} per image",
@@ -308,19 +309,20 @@ def info_rows(report: StreamReport) -> Rows:
         share = report.median_motion / max(report.width, report.height)
         motion = f"{report.median_motion:.2f} px per frame, {share:.1%} of the longer side"
     display = report.display
+    mirrored = ", then mirrored top to bottom" if display.is_mirrored else ""
     cropped = any(display.crop)
     return [
         ("video", str(report.path)),
         ("container", report.container),
         ("codec", "av1"),
         ("size", f"{report.width}x{report.height}"),
-        ("rotation", f"{display.rotation}{', upside down' if display.is_mirrored else ''}"),
+        ("rotation", f"{display.rotation}{mirrored}"),
         *([("cropped", "{} left, {} top, {} right, {} bottom".format(*display.crop))] * cropped),
         *([("pixel aspect", f"{display.pixel_aspect:.3f}")] * (display.pixel_aspect != 1)),
         ("frame rate", rate),
         ("frames", frames),
         ("references", ", ".join(references) or "none"),
-        ("inter units", f"{report.inter_share:.1%}"),
+        ("inter-coded area", f"{report.inter_share:.1%}"),
         ("median motion", motion),
         ("bytes per frame", f"{report.bytes_per_frame:.0f}"),
         ("bits per pixel", f"{report.bits_per_pixel:.3f}"),

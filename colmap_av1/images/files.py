@@ -40,7 +40,7 @@ from colmap_av1.video.unchanged import unchanged
 _Image = NDArray[np.uint8]
 
 # Extensions of images that can be read.
-READABLE = {*WRITE_PARAMETERS, ".bmp", ".tif", ".tiff", ".webp"}
+READABLE = {*WRITE_PARAMETERS, ".bmp", ".tif", ".tiff"}
 # Longer side in pixels at which detail is measured. Larger pictures are often soft at full size,
 # which does no harm.
 _DETAIL_SIZE = 960

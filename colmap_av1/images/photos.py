@@ -21,7 +21,18 @@ from colmap_av1.video.unchanged import FileState, file_state
 
 # Extensions of photos of phones and cameras that cannot be read. They cause a warning, unlike other
 # files next to photos.
-_UNREADABLE_PHOTOS = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
+_UNREADABLE_PHOTOS = {
+    ".webp",
+    ".heic",
+    ".heif",
+    ".avif",
+    ".dng",
+    ".cr2",
+    ".cr3",
+    ".nef",
+    ".arw",
+    ".raf",
+}
 _NUM_NAMED = 3
 # Markers of JPEG (ITU-T T.81, table B.1). The end of the image does not occur within a scan.
 _START_OF_IMAGE, _END_OF_IMAGE, _START_OF_SCAN = b"\xff\xd8", b"\xff\xd9", b"\xda"

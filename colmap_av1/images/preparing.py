@@ -161,19 +161,18 @@ def prepare_images(
     if folder is not None:
         names, frames = found.chosen.names, found.chosen.frames.tolist()
         check_image_folder(folder, names, size)
-        kept = zip(names, frames, strict=True)
-        first_kept = next(((n, f) for n, f in kept if (folder / n).exists()), None)
-        if not existing and first_kept is not None:
-            name, frame = first_kept
+        kept = [(n, f) for n, f in zip(names, frames, strict=True) if (folder / n).exists()]
+        if not existing and kept:
+            ends = dict([kept[0], kept[-1]])
             pictures = decode_pictures(
                 source,
                 found.tracks.num_frames,
                 options.reading,
                 display,
-                wanted=frames_near([frame]),
+                wanted=frames_near(ends.values()),
                 context=context,
             )
-            check_content([folder / name], [frame], pictures)
+            check_content([folder / name for name in ends], list(ends.values()), pictures)
     return PreparedImages(
         source=source,
         display=display,

@@ -19,6 +19,9 @@ _Image = NDArray[np.uint8]
 # Width and height of thumbnails: small enough to hide scaling and JPEG compression, large enough to
 # show the motion between frames.
 _THUMBNAIL = 48
+# Standard deviation of the grey values of a picture that counts as half flat. All flat pictures are
+# similar, as at a fade from black.
+_FLAT = 1.0
 # Smallest normalised correlation of an image with its frame.
 _MIN_CORRELATION = 0.98
 # The dissimilarity (1 - correlation) of any other frame must exceed that of the image's own frame
@@ -189,8 +192,8 @@ def _ascending_assignment(similarity: NDArray[np.float32]) -> NDArray[np.int32]:
 
 
 def _thumbnail(image: _Image) -> NDArray[np.float32]:
-    """Grey values of a picture at low resolution, with mean 0 and norm 1."""
+    """Grey values of a picture at low resolution minus their mean, then `_FLAT`, with norm 1."""
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
     small = cv2.resize(grey, (_THUMBNAIL, _THUMBNAIL), interpolation=cv2.INTER_AREA).reshape(-1)
-    small -= small.mean()
-    return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6), dtype=np.float32)
+    values = np.append(small - small.mean(), np.float32(_FLAT * _THUMBNAIL))
+    return np.asarray(values / np.linalg.norm(values), dtype=np.float32)

@@ -34,7 +34,6 @@ class CameraOptions(Options):
     """
 
     title: ClassVar[str] = "camera"
-    colmap_prefix: ClassVar[str] = "ImageReader"
 
     camera_model: str | None = option(
         None,
@@ -42,6 +41,7 @@ class CameraOptions(Options):
         "or can be estimated from the tracks, or if the images of a video show that the lens needs "
         "it, else SIMPLE_RADIAL; OPENCV, which has two focal lengths, if pixels are not square",
         common=True,
+        colmap="ImageReader.camera_model",
     )
     camera_params: str | None = option(
         None,
@@ -49,11 +49,13 @@ class CameraOptions(Options):
         "estimated from the tracks, else it starts at 0.9 times the longer side (fisheye models: "
         "0.5 times) and is refined; the principal point is the image centre",
         common=True,
+        colmap="ImageReader.camera_params",
     )
     single_camera: bool | None = option(
         None,
         "1: one camera for all images; 0: one for each image; None: one for each video, and one "
         "for the photos of each camera and size",
+        colmap="ImageReader.single_camera",
     )
 
     rolling_shutter: str = option(

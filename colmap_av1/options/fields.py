@@ -41,6 +41,7 @@ class Declared:
         among: the only allowed values.
         common: whether most users need the option.
         spellings: further names on the command line.
+        colmap: COLMAP's name, such as ImageReader.camera_model, which is accepted as well.
         unused: paths of fields of this part that have no effect here.
     """
 
@@ -53,6 +54,7 @@ class Declared:
     among: tuple[int, ...] = ()
     common: bool = False
     spellings: tuple[str, ...] = ()
+    colmap: str = ""
     unused: frozenset[str] = frozenset()
 
 
@@ -68,10 +70,20 @@ def option(
     among: tuple[int, ...] = (),
     common: bool = False,
     spellings: tuple[str, ...] = (),
+    colmap: str = "",
 ) -> _Value:
     """Declare a field of an options dataclass, see `Declared`."""
     declared = Declared(
-        help, least, most, above, below, unit, among, common=common, spellings=spellings
+        help,
+        least,
+        most,
+        above,
+        below,
+        unit,
+        among,
+        common=common,
+        spellings=spellings,
+        colmap=colmap,
     )
     return dataclasses.field(default=default, metadata={_DECLARED: declared})
 
@@ -92,14 +104,12 @@ class Options:
 
     Attributes:
         title: title of the group in help texts.
-        colmap_prefix: COLMAP's name of the group, as in --ImageReader.camera_model.
 
     Raises:
         OptionError: a value has the wrong type or is out of bounds.
     """
 
     title: ClassVar[str] = ""
-    colmap_prefix: ClassVar[str] = ""
 
     def __init_subclass__(cls) -> None:
         # The help of the fields is part of the docstring, for `help()` and the documentation.
@@ -192,8 +202,7 @@ def _is_of(value: Any, hint: Any) -> bool:
 
 def _is_within(value: float, declared: Declared) -> bool:
     return (
-        math.isfinite(value)
-        and abs(value) <= _LARGEST
+        abs(value) <= _LARGEST  # false for NaN
         and (declared.least is None or value >= declared.least)
         and (declared.most is None or value <= declared.most)
         and (declared.above is None or value > declared.above)
@@ -220,7 +229,7 @@ def _wanted(value: Any, hint: Any, declared: Declared) -> str:
     bounds = _bounds(declared)
     if not _is_of(value, first):
         return f"{_KINDS[first]}{bounds and f', {bounds}'}{none}"
-    if math.isfinite(value) and abs(value) > _LARGEST:
+    if _LARGEST < abs(value) < math.inf:
         bounds = f"{_LARGEST} at most"
     return (bounds or f"a finite {_KINDS[first].removeprefix('a ')}") + none
 

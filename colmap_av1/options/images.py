@@ -105,13 +105,13 @@ class MaskOptions(Options):
     """
 
     title: ClassVar[str] = "masks"
-    colmap_prefix: ClassVar[str] = "ImageReader"
 
     mask_path: str | os.PathLike[str] | None = option(
         None,
         "masks, whose black pixels are ignored: one PNG for all frames, or a folder with one for "
         "each frame, or with NAME.png for each image as in COLMAP",
         common=True,
+        colmap="ImageReader.mask_path",
     )
 
 

@@ -87,7 +87,6 @@ class VerifyOptions(Options):
     """
 
     title: ClassVar[str] = "two-view geometry"
-    colmap_prefix: ClassVar[str] = "TwoViewGeometry"
 
     verify: Literal["auto", "joint", "pairs"] = option(
         "auto",
@@ -101,8 +100,14 @@ class VerifyOptions(Options):
         "largest Sampson error (E, F) or transfer error (H) of an inlier, in pixels",
         above=0,
         unit="a number of pixels",
+        colmap="TwoViewGeometry.max_error",
     )
-    min_num_inliers: int = option(15, "fewest inliers of a two-view geometry", least=1)
+    min_num_inliers: int = option(
+        15,
+        "fewest inliers of a two-view geometry",
+        least=1,
+        colmap="TwoViewGeometry.min_num_inliers",
+    )
     min_e_f_inlier_ratio: float = option(
         0.95,
         "trust the focal length prior if the essential matrix has more than this fraction of the "
@@ -126,7 +131,10 @@ class VerifyOptions(Options):
         least=MIN_MATCHES,
     )
     max_iterations: int = option(
-        10000, "largest number of iterations of the robust estimators", least=1
+        10000,
+        "largest number of iterations of the robust estimators",
+        least=1,
+        colmap="TwoViewGeometry.max_num_trials",
     )
     confidence: float = option(
         0.999,
@@ -134,4 +142,5 @@ class VerifyOptions(Options):
         least=0,
         most=1,
         unit="a probability",
+        colmap="TwoViewGeometry.confidence",
     )

@@ -104,6 +104,7 @@ class MapOptions(Options):
         above=0,
         below=90,
         unit="degrees",
+        colmap="Mapper.init_min_tri_angle",
     )
     refine_intrinsics: bool = option(
         True,
@@ -194,10 +195,9 @@ class ExportOptions(Options):
     Examples:
         >>> from colmap_av1 import ExportOptions
         >>> ExportOptions(verified=False)
-        ExportOptions(format='hloc', verified=False)
+        ExportOptions(verified=False)
     """
 
     title: ClassVar[str] = "files"
 
-    format: Literal["hloc"] = option("hloc", "program whose file format is written")
     verified: bool = option(True, "export only inliers of each pair's two-view geometry")

@@ -20,8 +20,6 @@ class RunOptions(Options):
     """
 
     title: ClassVar[str] = "run"
-    # COLMAP's group for the seed and the threads.
-    colmap_prefix: ClassVar[str] = "TwoViewGeometry"
 
     num_threads: int | None = option(
         None,

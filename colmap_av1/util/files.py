@@ -113,7 +113,7 @@ def check_creatable(path: Path) -> None:
     Raises:
         OptionError: it cannot be created.
     """
-    above = next(folder for folder in path.absolute().parents if folder.exists())
+    above = next((folder for folder in path.absolute().parents if folder.exists()), path.absolute())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         raise OptionError(f"{path}: cannot be created in {above}: give another path")
 
@@ -127,6 +127,18 @@ def check_apart(output: Path, inputs: Iterable[_Path | None]) -> None:
     for given in inputs:
         if given is not None and Path(given).resolve().is_relative_to(output.resolve()):
             raise OptionError(f"{output}: is or contains the input {given}: give another folder")
+
+
+def check_outside(output: Path, photos: _Path | None) -> None:
+    """Check that an output folder is not in the folder of the photos, which is searched for photos.
+
+    Raises:
+        OptionError: it is.
+    """
+    if photos is not None and output.resolve().is_relative_to(Path(photos).resolve()):
+        raise OptionError(
+            f"{output}: is in {photos}, which is searched for photos: give a folder outside it"
+        )
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import codecs
 import os
 import unicodedata
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath
 
 from colmap_av1.errors import ImageError
 
@@ -71,8 +71,8 @@ def check_name(name: str) -> None:
     Raises:
         ImageError: the name leads out of the folder, or no file can have it.
     """
-    parts = PurePosixPath(name)
-    if parts.is_absolute() or ".." in parts.parts:
+    parts = PurePath(name)
+    if parts.anchor or ".." in parts.parts:  # on Windows also a drive
         raise ImageError(
             f"image {name!r} lies outside the image folder: give names within the folder"
         )

@@ -296,12 +296,6 @@ def open_stream(video: str | os.PathLike[str]) -> VideoStream:
     return VideoStream(video)
 
 
-def packets(video: str | os.PathLike[str]) -> Iterator[Packet]:
-    """Open a video file and read its packets, as `VideoStream.packets`."""
-    with open_stream(video) as stream:
-        yield from stream.packets()
-
-
 class _IvfWithRate(io.FileIO):
     """An IVF file read as if its header had a frame rate, because FFmpeg rejects a rate of 0."""
 

@@ -37,7 +37,7 @@ from colmap_av1.video.encoders import (
     KEY_FRAME_DISTANCE,
     TALK,
     find_encoder,
-    reason_of,
+    reason_in_log,
     settings,
 )
 from colmap_av1.video.facts import Video, read_video, with_counted_packets
@@ -139,7 +139,7 @@ def _encode(
     is_kept: bool,
 ) -> EncodeReport:
     """Do the work of `encode`; `is_kept` marks the output as a kept stream of the video."""
-    path, output = Path(video), Path(output)
+    path, output = Path(video), Path(output).resolve()  # a link keeps leading to the output
     if output.suffix.lower() not in _FORMATS:
         raise OptionError(f"{output}: give an output that ends in {', '.join(_FORMATS)}")
     check_new_file(output, [path], overwrite=overwrite)
@@ -300,7 +300,7 @@ def _run(command: Sequence[str], video: VideoFile, report: Callable[[int], None]
         log_file.seek(0)
         log = log_file.read().decode(errors="replace")
     if status != 0:
-        reason = reason_of(log)
+        reason = reason_in_log(log)
         if "No space left" in log:
             raise EncodeError(
                 f"{video}: the disk is full: free some space, or write the stream elsewhere"

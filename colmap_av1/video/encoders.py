@@ -156,9 +156,12 @@ def find_encoder(options: EncodeOptions) -> tuple[str, str]:
             reasons.append(f"{name}: {reason}")
     if options.encoder == "auto":
         tried = f"none of {', '.join(names)} works"
+        remedy = "pip install imageio-ffmpeg"
+        if options.speed is not None:
+            remedy = "leave out --speed, or give another one"
         raise EncodeError(
             f"no AV1 encoder: {tried} with {' or '.join(programs) or 'any ffmpeg'} "
-            f"({reasons[-1] if reasons else 'there is none'}): pip install imageio-ffmpeg"
+            f"({reasons[-1] if reasons else 'there is none'}): {remedy}"
         )
     raise EncodeError(
         f"the encoder does not work here ({'; '.join(reasons) or 'there is no ffmpeg'}): give "
@@ -229,10 +232,10 @@ def _probe(program: str, encoder: _Encoder, quality: int, speed: int) -> str | N
         return f"no frame within {_PROBE_TIMEOUT:.0f} s"
     except OSError as error:
         return f"{program}: {error.strerror}"
-    return None if run.returncode == 0 else reason_of(run.stderr)
+    return None if run.returncode == 0 else reason_in_log(run.stderr)
 
 
-def reason_of(text: str) -> str:
+def reason_in_log(text: str) -> str:
     """The reason of a failure in ffmpeg's log, on one line."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     # The first error gives the reason; later ones only say that the conversion failed. If ffmpeg

@@ -14,7 +14,6 @@ import pytest
 from colmap_av1.cli import main
 from colmap_av1.cli.options import add_options, given
 from colmap_av1.cli.parser import Parser
-from colmap_av1.cli.program import make_parser
 from colmap_av1.options import (
     CompareOptions,
     DensifyOptions,
@@ -60,7 +59,6 @@ BAD = [
     ("encode", "encoder", "x"),
     ("info", "operating_point", "32"),
     ("motion", "num_threads", "0"),
-    ("export", "format", "xml"),
     ("view", "draw", "arrows"),
 ]
 
@@ -193,13 +191,14 @@ def test_names_of_colmap_and_of_earlier_versions_are_accepted() -> None:
     words = (
         "--ImageReader.camera_model PINHOLE --ImageReader.single_camera 0 "
         "--TwoViewGeometry.max_error 3 --TwoViewGeometry.min_num_inliers 20 "
-        "--TwoViewGeometry.seed 5 --TwoViewGeometry.num_threads 2"
+        "--TwoViewGeometry.max_num_trials 50 --seed 5 --num_threads 2"
     )
     options = parse(words, MatchOptions)
     assert isinstance(options, MatchOptions)
     assert options.camera.camera_model == "PINHOLE"
     assert not options.camera.single_camera
     assert (options.verify.max_error, options.verify.min_num_inliers) == (3, 20)
+    assert options.verify.max_iterations == 50
     assert options.run == RunOptions(num_threads=2, seed=5)
     assert parse("--seed 5", MatchOptions) == parse("--random_seed 5", MatchOptions)
 
@@ -256,14 +255,3 @@ def test_one_name_cannot_set_two_options() -> None:
     command = Parser(prog="test")
     with pytest.raises(argparse.ArgumentError, match="--strength"):
         add_options(command, type("Twice", (_Twice,), {"__module__": __name__}))
-
-
-@pytest.mark.parametrize("command", ["match", "reconstruct", "densify"])
-@pytest.mark.parametrize("spelling", ["--photos", "--images"])
-def test_photos_have_two_spellings_and_help_shows_one(
-    command: str, spelling: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    parser, _ = make_parser([command])
-    namespace = parser.parse_args([command, *NEEDED[command], spelling, "album"])
-    assert namespace.photos == "album"
-    assert "images" not in options_in(help_of(command, "--help-all", capsys))

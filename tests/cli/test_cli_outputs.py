@@ -121,6 +121,24 @@ def test_reports_only_replace_reports(
     assert (work / "new/r.json").exists()
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "match --database new.db --video v.mp4 --report_json new.db",
+        "match --database new.db --video v.mp4 --keep_stream s.mp4 --report_json s.mp4",
+        "reconstruct --video v.mp4 --output new --report_json new/report.json",
+    ],
+)
+def test_reports_do_not_replace_other_outputs(
+    words: str, work: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = contents(work)
+    assert main(words.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "output" in line
+    assert contents(work) == before
+
+
 @pytest.mark.parametrize("report", ["notes.log/r.json", "closed/new/r.json"])
 def test_reports_that_cannot_be_created_are_refused_before_the_work(
     report: str, work: Path, capsys: pytest.CaptureFixture[str]

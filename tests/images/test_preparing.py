@@ -119,3 +119,7 @@ def test_existing_images_of_another_video_are_refused(
         prepared(clip, tmp_path / "images")
     write_images(clip, tmp_path / "own", names[:3], range(3))
     assert prepared(clip, tmp_path / "own").tracked.chosen.names == names
+    # Another program numbered every fifth frame from 0.
+    write_images(clip, tmp_path / "fifth", names[:3], range(0, 15, 5))
+    with pytest.raises(ImageError, match=r"frame_000002\.png"):
+        prepared(clip, tmp_path / "fifth")

@@ -165,6 +165,16 @@ def test_content_check_detects_an_offset_of_one_frame(tmp_path: Path) -> None:
         check_content(files, [3, 9], enumerate(pan(12, 2, seed=1)))
 
 
+def test_flat_pictures_at_a_fade_are_recognised(tmp_path: Path) -> None:
+    pictures = [np.zeros_like(picture) for picture in pan(3, 2)] + pan(12, 2)
+    files = write(tmp_path / "images", [pictures[k] for k in (0, 5, 9)], "jpg")
+    check_content(files, [0, 5, 9], enumerate(pictures))
+    with pytest.raises(ImageError, match=r"000\.jpg"):
+        check_content(files, [4, 5, 9], enumerate(pictures))
+    files = write(tmp_path / "all", [pictures[k] for k in (2, 5, 9)])
+    assert frames_by_content(files, enumerate(pictures)).tolist()[1:] == [5, 9]
+
+
 @pytest.mark.parametrize("turn", [((-1, 0), (0, -1)), ((1, 0), (0, -1)), ((0, 1), (1, 0))])
 def test_unrotated_images_are_recognised(
     tmp_path: Path, turn: tuple[tuple[int, int], tuple[int, int]]

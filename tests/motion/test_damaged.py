@@ -20,6 +20,7 @@ from conformance import parse
 from conftest import PROJECT, SHARED, TEST_PATHS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from ivf_files import packets
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
@@ -28,7 +29,6 @@ from colmap_av1.motion.frame_motion import BLOCK, FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
 from colmap_av1.tracks.tracks import build_tracks
-from colmap_av1.video.container import packets
 from colmap_av1.video.decoding import decode_frames
 
 _DATA = PROJECT / "tests" / "data" / "conformance"

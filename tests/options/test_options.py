@@ -152,7 +152,7 @@ REFUSED: list[tuple[type, dict[str, Any]]] = [
         {"match": MatchOptions(images=ImageOptions(image_name="a_%d.png")), "image_type": "jpg"},
     ),
     (ReconstructOptions, {"image_type": "bmp"}),
-    (ExportOptions, {"format": "xml"}),
+    (ExportOptions, {"verified": 2}),
     (LearnedOptions, {"max_keypoints": 15}),
     (LearnedOptions, {"max_image_size": 63}),
     (LearnedOptions, {"learned_every": 0}),

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import av
 
-from colmap_av1.video.container import packets
+from colmap_av1.video.container import Packet, open_stream
+
+
+def packets(video: Path) -> Iterator[Packet]:
+    """The packets of a video file."""
+    with open_stream(video) as stream:
+        yield from stream.packets()
 
 
 def ivf_of(clip: Path) -> bytes:

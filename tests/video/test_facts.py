@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 from conftest import Ffmpeg
+from ivf_files import packets
 
 from colmap_av1 import match
 from colmap_av1.errors import BitstreamError, OptionError, VideoError
 from colmap_av1.motion.info import read_info
 from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions
-from colmap_av1.video.container import packets, read_file
+from colmap_av1.video.container import read_file
 from colmap_av1.video.facts import frame_times, read_video, with_counted_packets
 from colmap_av1.video.unchanged import check_unchanged
 

@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 import pytest
 from conftest import AV1, SHARED, Encode, Ffmpeg, make_frames
-from ivf_files import frame_headers, ivf_of, with_repeats
+from ivf_files import frame_headers, ivf_of, packets, with_repeats
 
 from colmap_av1.cli import main
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
 from colmap_av1.motion.info import read_info
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
-from colmap_av1.video.container import open_stream, packets
+from colmap_av1.video.container import open_stream
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.facts import read_video
 
