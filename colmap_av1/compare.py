@@ -13,7 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.check.model_figures import model_figures
-from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError
+from colmap_av1.errors import ColmapAv1Error, ImageError, ModelError, OptionError
 from colmap_av1.evaluate.frontends.footage import Footage, choose_footage
 from colmap_av1.evaluate.frontends.frontend import Frontend, run_frontend
 from colmap_av1.evaluate.frontends.imported import imported_frontend
@@ -158,7 +158,10 @@ def compare(
             pose_reference=found.pose_source,
             is_truth=found.is_truth,
             columns=tuple(column for column, _ in measured),
-            warnings=footage.warnings,
+            warnings=(
+                *footage.warnings,
+                *(f"{column.name}: {text}" for column, _ in measured for text in column.warnings),
+            ),
         )
         clouds = {column.name: cloud for column, cloud in measured if cloud is not None}
         write_report(report, clouds, footage)
@@ -181,6 +184,8 @@ def _writing(output: Path) -> Iterator[None]:
 def _check_reference(output: Path, reference: str | os.PathLike[str] | None) -> None:
     """Refuse a reference within the output, except the model of a front-end, which is kept."""
     models = (output / _FRONTENDS).resolve()
+    if reference is not None and not Path(reference).exists():
+        raise ImageError(f"{reference}: no such file or folder: give the ground truth")
     if reference is not None and not Path(reference).resolve().is_relative_to(models):
         check_apart(output, [reference])
 
@@ -201,7 +206,8 @@ def _chosen_frontends(options: CompareOptions) -> dict[str, Frontend]:
             features, colon, matches = files.rpartition(":")
             if not (colon and features and matches):
                 raise OptionError(f"front-end '{word}': give NAME=FEATURES.h5:MATCHES.h5")
-            if name in known or not name or Path(name).name != name:
+            is_taken = name in known or name.startswith(f"{_OWN}-")
+            if is_taken or name in {"", ".."} or Path(name).name != name:
                 raise OptionError(f"front-end '{word}': name is taken or invalid: give another")
             frontend = imported_frontend(Path(features), Path(matches))
         elif name in known:
@@ -239,6 +245,7 @@ def _run_column(
         run = run_frontend(name, footage, folder / "matches", frontend)
         column = replace(
             column,
+            warnings=run.warnings,
             seconds=run.seconds,
             cpu_seconds={"matching": run.cpu_seconds},
             peak_memory=run.peak_memory,
@@ -266,6 +273,7 @@ def _run_column(
         made = densify_model(column.model_path, footage, folder / "all-tracks", densify)
         dense = replace(
             dense,
+            warnings=made.warnings,
             seconds={**column.seconds, "all tracks": made.seconds},
             cpu_seconds={**column.cpu_seconds, "all tracks": made.cpu_seconds},
             peak_memory=_larger(column.peak_memory, made.peak_memory),
@@ -371,6 +379,9 @@ def _measure(
     similarity = None
     if reference.poses is not None:
         similarity = fit_similarity(poses, reference.poses)
+        if similarity is None:
+            lost = f"fewer than 3 poses, or poses on a line, in common with {reference.pose_source}"
+            column = replace(column, warnings=(*column.warnings, f"no errors: {lost}"))
     if similarity is not None:
         points = similarity * points
         if reference.points is not None and reference.cloud_source != column.name:

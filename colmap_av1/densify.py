@@ -38,6 +38,7 @@ from colmap_av1.images.of_videos import VideoImages, images_of_videos
 from colmap_av1.images.photos import Photo
 from colmap_av1.images.track_images import ImageChoice, TrackedImages, track_chosen_images
 from colmap_av1.options import DensifyOptions
+from colmap_av1.reconstruct import read_report
 from colmap_av1.splats.gaussians import (
     check_gaussians_path,
     initial_gaussians,
@@ -148,6 +149,7 @@ def densify(
     check_new_folder(output, MODEL_FILES, read, overwrite=overwrite)
     check_outside(output, photos)
     check_gaussians_path(gaussians, read, overwrite=overwrite)
+    _check_distorted(model)
     reconstruction = read_model(model)
     posed = posed_images(reconstruction)
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
@@ -340,6 +342,28 @@ def _agreement(model: Path, points: TriangulatedPoints) -> float:
             "come from, and check that their names are frame numbers (--first_number, --frame_list)"
         )
     return agreeing
+
+
+def _check_distorted(model: Path) -> None:
+    """Refuse a model of `reconstruct` whose images are undistorted, because tracks are not.
+
+    Raises:
+        ModelError: it is one.
+    """
+    folder = model.resolve()
+    if folder.parts[-2:] != ("sparse", "0"):
+        return
+    # The report of further models, in OUTPUT/model_1/sparse/0, is in OUTPUT.
+    for output in folder.parents[1:3]:
+        try:
+            report = read_report(output)
+        except ModelError:  # this is no output of `reconstruct`
+            continue
+        if report.undistorted:
+            raise ModelError(
+                f"{model}: its images are undistorted, but tracks are not: run reconstruct with "
+                "other options for points, or with --undistort 0, or give the model of a mapper"
+            )
 
 
 def _read_inputs(

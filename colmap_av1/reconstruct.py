@@ -106,6 +106,7 @@ class ReconstructReport:
             to the last; None if the tracks were not corrected for it.
         place: where the model lies in the world, as in `place.json`.
         focal_lengths: the shortest and the longest focal length of the output's cameras, in pixels.
+        undistorted: whether images were undistorted, so that they differ from the pictures.
         mapper: the mapper of COLMAP that estimated the poses.
         forward_motion: whether the camera moves along its optical axis, see `MatchReport`.
         links: SIFT links between images that motion does not connect.
@@ -140,6 +141,7 @@ class ReconstructReport:
     read_outs: tuple[float | None, ...]
     place: Place
     focal_lengths: tuple[float, float]
+    undistorted: bool
     mapper: str
     forward_motion: bool
     links: LinkReport
@@ -317,6 +319,7 @@ def _run_stages(run: Run) -> ReconstructReport:
         read_outs=tuple(stage.result.read_out for stage in tracked),
         place=placed.result.place,
         focal_lengths=model.focal_lengths,
+        undistorted=model.undistorted,
         mapper=posed.mapped.result.mapper,
         forward_motion=matches.forward_motion,
         links=matches.links,

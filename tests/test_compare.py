@@ -416,10 +416,16 @@ def test_reference_without_the_poses_of_the_images_is_an_error(video, tmp_path):
     options = CompareOptions(match=OPTIONS)
     with pytest.raises(ModelError, match="1 of the 8"):
         compare(video, tmp_path / "report", reference=poses, options=options)
+    poses.write_text("0.png 0 0 0 0 0 0 1\n1.png 1 0 0 0 0 0 1\n0.png 0 0 0 0 0 0 1\n")
+    with pytest.raises(ImageError, match="twice"):
+        compare(video, tmp_path / "report", reference=poses, options=options)
+    poses.write_text("1 0 0 0.1 0 1 0 0.2 0 0 1 0.3\n")  # KITTI
+    with pytest.raises(ImageError, match="not a pose"):
+        compare(video, tmp_path / "report", reference=poses, options=options)
     poses.write_text("0.png 0 0 here\n")
     with pytest.raises(ImageError, match="0 0 here"):
         compare(video, tmp_path / "report", reference=poses, options=options)
-    with pytest.raises(ImageError, match="No such file"):
+    with pytest.raises(ImageError, match="no such file"):
         compare(video, tmp_path / "report", reference=tmp_path / "none", options=options)
 
 

@@ -578,11 +578,15 @@ def test_commands_print_their_results_and_write_gaussians(
     assert f"points\t{made.num_points}, " in printed.out
     assert "resumed stages\ttracks, " in printed.out
     model = copy / "sparse" / "0"
+    distorted = [*words[:-2], "--undistort", "0", "--quiet"]
     words = ["densify", "--model", str(model), "--video", str(SCENE), "--frame_list"]
     (tmp_path / "list.txt").write_text(
         "".join(f"{f} frame_{f:06d}.jpg\n" for f in range(0, 60, EVERY))
     )
     words += [str(tmp_path / "list.txt"), "--output", str(tmp_path / "dense")]
+    assert main(words) == 2
+    assert "undistorted" in capsys.readouterr().err
+    assert main(distorted) == 0
     assert main([*words, "--gaussians", str(tmp_path / "init")]) == 2
     assert ".ply" in capsys.readouterr().err
     # Brush reads init.ply or the last .ply file of a folder, so there is one only if requested.

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.geometry.cameras import is_undistorted
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, take_points, write_model
 from colmap_av1.geometry.coverage import PosedCamera, coverage, views_of
 from colmap_av1.geometry.masks import Mask
@@ -240,6 +241,7 @@ class ModelResult:
         coverage: share of the images' cells of 16x16 pixels that visible points project into.
         mean_error: mean reprojection error of the points in pixels.
         focal_lengths: the shortest and the longest of the cameras in pixels.
+        undistorted: whether images were undistorted, so that they differ from the pictures.
         agreeing: share of the tracks that agree with the poses.
     """
 
@@ -248,6 +250,7 @@ class ModelResult:
     coverage: float
     mean_error: float
     focal_lengths: tuple[float, float]
+    undistorted: bool
     agreeing: float
 
 
@@ -302,6 +305,7 @@ def model_stage(
             coverage=covered,
             mean_error=mean_error(cloud),
             focal_lengths=(min(focal), max(focal)),
+            undistorted=options.undistort and not all(map(is_undistorted, placed.cameras.values())),
             agreeing=agreeing,
         )
 

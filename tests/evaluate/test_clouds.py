@@ -6,9 +6,11 @@ import numpy as np
 import pycolmap
 import pytest
 from dense_points import depth_differences
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from colmap_av1.evaluate.metrics.clouds import cloud_distances, point_cloud
-from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses
+from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses, pose_errors
 from colmap_av1.geometry.alignment import transform_poses
 
 
@@ -78,3 +80,30 @@ def test_models_are_aligned_by_their_cameras() -> None:
         transform_poses(similarity, image_poses(moved, names)), poses[:-1], atol=1e-6
     )
     assert fit_similarity(np.full_like(poses, np.nan), poses) is None
+
+
+def test_poses_in_a_plane_are_aligned_and_those_on_a_line_are_not() -> None:
+    rng = np.random.default_rng(0)
+    centres = np.column_stack([rng.normal(size=(9, 2)), np.zeros(9)])
+    rotations = Rotation.random(9, rng).as_matrix()
+
+    def poses(centres: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.concatenate([rotations, -rotations @ centres[:, :, None]], axis=2)
+
+    truth = poses(centres)
+    moved = pycolmap.Sim3d(2.5, pycolmap.Rotation3d(np.array([0.5, 0.5, 0.5, 0.5])), [1, 2, 3])
+    estimated = transform_poses(moved.inverse(), truth)
+    errors = pose_errors(estimated, truth)
+    assert errors is not None
+    assert errors.ate == pytest.approx(0, abs=1e-9)
+    assert errors.robust_rms == pytest.approx(0, abs=1e-9)
+    similarity = fit_similarity(estimated, truth)
+    assert similarity is not None
+    np.testing.assert_allclose(similarity.matrix(), moved.matrix(), atol=1e-9)
+    on_line = poses(np.outer(np.arange(9.0), [1.0, 2.0, 3.0]))
+    assert fit_similarity(on_line, truth) is None
+    assert pose_errors(truth, on_line) is None
+
+
+def test_reference_without_extent_gives_no_distances() -> None:
+    assert cloud_distances(np.random.default_rng(0).random((5, 3)), np.ones((1, 3))) is None

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from colmap_av1.evaluate.frontends.footage import Footage, frame_list
-from colmap_av1.evaluate.frontends.frontend import Frontend
+from colmap_av1.evaluate.frontends.frontend import Filled, Frontend
 from colmap_av1.match import match
 from colmap_av1.options import ImageOptions, MatchOptions
 
@@ -27,8 +27,8 @@ def av1_frontend(refine: Literal["none", "lk"], preset: Preset, options: MatchOp
     return Frontend(partial(_match, given), lambda _: (anywhere,))
 
 
-def _match(options: MatchOptions, footage: Footage, database: Path) -> dict[str, float]:
+def _match(options: MatchOptions, footage: Footage, database: Path) -> Filled:
     images = ImageOptions(frame_list=frame_list(footage, database.with_name("frames.txt")))
     options = replace(options, camera=footage.camera, images=images, on_existing="error")
     report = match(database, footage.video, image_path=footage.image_path, options=options)
-    return report.seconds
+    return Filled(report.seconds, report.warnings)

@@ -21,6 +21,19 @@ OF_OTHERS = ("evaluate/frontends",)
 
 
 @dataclass(frozen=True)
+class Filled:
+    """What a front-end reports when it has filled a database.
+
+    Attributes:
+        seconds: wall time of each stage.
+        warnings: warnings for the user.
+    """
+
+    seconds: dict[str, float]
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class FrontendRun:
     """A database and the cost of filling it.
 
@@ -28,6 +41,7 @@ class FrontendRun:
         name: the front-end.
         database: the COLMAP database.
         seconds: wall time of each stage.
+        warnings: warnings for the user.
         cpu_seconds: total CPU time of all stages.
         peak_memory: largest resident memory in bytes; None if the system does not report it.
     """
@@ -35,6 +49,7 @@ class FrontendRun:
     name: str
     database: Path
     seconds: dict[str, float]
+    warnings: tuple[str, ...]
     cpu_seconds: float
     peak_memory: int | None
 
@@ -44,8 +59,7 @@ class Frontend:
     """One way to fill a database.
 
     Attributes:
-        run: creates the given database from the footage, and returns the wall time of each stage.
-            Called in a separate process.
+        run: creates the given database from the footage. Called in a separate process.
         depends_on: what the result depends on in addition to name, video, frames and camera, see
             `digest_of`.
         made_by: folders of this package whose code changes the result.
@@ -53,7 +67,7 @@ class Frontend:
         files: further input files of the user.
     """
 
-    run: Callable[[Footage, Path], dict[str, float]]
+    run: Callable[[Footage, Path], Filled]
     depends_on: Callable[[Footage], tuple[Any, ...]]
     made_by: tuple[str, ...] = WHOLE_PACKAGE
     check: Callable[[], None] = lambda: None
@@ -78,7 +92,8 @@ def run_frontend(name: str, footage: Footage, folder: Path, frontend: Frontend) 
     def make() -> dict[str, Any]:
         measured = run_measured(frontend.run, footage, database, log=folder / "log.txt")
         return {
-            "seconds": measured.result,
+            "seconds": measured.result.seconds,
+            "warnings": measured.result.warnings,
             "cpu_seconds": measured.cpu_seconds,
             "peak_memory": measured.peak_memory,
         }
@@ -93,7 +108,8 @@ def run_frontend(name: str, footage: Footage, folder: Path, frontend: Frontend) 
         made_by=frontend.made_by,
         timed=True,
     )
-    return FrontendRun(name, database, **finished.result)
+    warnings = tuple(finished.result.pop("warnings"))
+    return FrontendRun(name, database, warnings=warnings, **finished.result)
 
 
 def camera_model(footage: Footage) -> str:

@@ -12,6 +12,7 @@ from colmap_av1.errors import HlocError
 from colmap_av1.evaluate.frontends.footage import Footage
 from colmap_av1.evaluate.frontends.frontend import (
     OF_OTHERS,
+    Filled,
     Frontend,
     images_digest,
     list_images,
@@ -40,7 +41,7 @@ def import_hloc(
     footage: Footage,
     database: Path,
     names: Sequence[str] | None = None,
-) -> dict[str, float]:
+) -> Filled:
     """Fill a database from files in hloc's layout.
 
     Args:
@@ -72,7 +73,7 @@ def import_hloc(
         listing = database.with_name("pairs.txt")
         listing.write_text("".join(f"{a} {b}\n" for a, b in pairs))
         pycolmap.verify_matches(database, listing)
-    return clock.seconds
+    return Filled(clock.seconds)
 
 
 def _write_hloc(found: HlocMatches, names: set[str], database: Path) -> list[tuple[str, str]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pycolmap
 
 from colmap_av1.evaluate.frontends.footage import Footage
-from colmap_av1.evaluate.frontends.frontend import OF_OTHERS, Frontend, images_digest
+from colmap_av1.evaluate.frontends.frontend import OF_OTHERS, Filled, Frontend, images_digest
 from colmap_av1.evaluate.frontends.imported import import_hloc
 from colmap_av1.evaluate.programs import check_packages, run_program
 from colmap_av1.options import LearnedOptions
@@ -37,13 +37,11 @@ def learned_frontend(features: str, options: LearnedOptions) -> Frontend:
     )
 
 
-def _learned(
-    features: str, options: LearnedOptions, footage: Footage, database: Path
-) -> dict[str, float]:
+def _learned(features: str, options: LearnedOptions, footage: Footage, database: Path) -> Filled:
     files = database.with_name("features.h5"), database.with_name("matches.h5")
     names = footage.names[:: options.learned_every]
     seconds = extract_and_match(features, footage.image_path, names, files, options)
-    return {**seconds, **import_hloc(files, footage, database, names)}
+    return Filled({**seconds, **import_hloc(files, footage, database, names).seconds})
 
 
 def extract_and_match(

@@ -26,6 +26,7 @@ class MapperRun:
     Attributes:
         model: folder of the model with the most images; None if there is no model.
         num_models: number of models.
+        warnings: warnings for the user.
         seconds: wall time of the mapper.
         cpu_seconds: CPU time of the mapper.
         peak_memory: largest resident memory in bytes; None if the system does not report it.
@@ -33,6 +34,7 @@ class MapperRun:
 
     model: Path | None
     num_models: int
+    warnings: tuple[str, ...]
     seconds: float
     cpu_seconds: float
     peak_memory: int | None
@@ -77,7 +79,8 @@ def measure_mapper(
         made_by=(*OF_OTHERS, "geometry", "poses"),
         timed=True,
     )
-    return MapperRun(model / "0" if finished.result["num_models"] else None, **finished.result)
+    found = model / "0" if finished.result["num_models"] else None
+    return MapperRun(found, warnings=(), **finished.result)
 
 
 def densify_model(
@@ -106,6 +109,7 @@ def densify_model(
         )
         return {
             "num_models": 1,
+            "warnings": measured.result,
             "seconds": measured.seconds,
             "cpu_seconds": measured.cpu_seconds,
             "peak_memory": measured.peak_memory,
@@ -115,9 +119,8 @@ def densify_model(
     # The location of the stream does not change the result.
     anywhere = replace(options, match=replace(options.match, keep_stream=None))
     given = (inputs, footage.names, footage.frames, anywhere)
-    return MapperRun(
-        output, **run_stage_in(folder, given, make, products=[output], timed=True).result
-    )
+    made = run_stage_in(folder, given, make, products=[output], timed=True).result
+    return MapperRun(output, warnings=tuple(made.pop("warnings")), **made)
 
 
 def _map(database: Path, image_path: Path, output: Path, options: MapOptions) -> int:
@@ -125,5 +128,5 @@ def _map(database: Path, image_path: Path, output: Path, options: MapOptions) ->
     return len(run_mapper(database, output, options, image_path=image_path))
 
 
-def _densify(model: Path, video: Path, output: Path, options: DensifyOptions) -> None:
-    densify(model, video, output, options=options)
+def _densify(model: Path, video: Path, output: Path, options: DensifyOptions) -> tuple[str, ...]:
+    return densify(model, video, output, options=options).warnings

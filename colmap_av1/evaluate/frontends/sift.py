@@ -11,6 +11,7 @@ import pycolmap
 from colmap_av1.evaluate.frontends.footage import Footage
 from colmap_av1.evaluate.frontends.frontend import (
     OF_OTHERS,
+    Filled,
     Frontend,
     images_digest,
     list_images,
@@ -29,7 +30,7 @@ def sift_frontend(pairing: Pairing) -> Frontend:
     )
 
 
-def _sift(pairing: Pairing, footage: Footage, database: Path) -> dict[str, float]:
+def _sift(pairing: Pairing, footage: Footage, database: Path) -> Filled:
     clock = Clock()
     pycolmap.set_random_seed(0)
     list_images(footage, database)
@@ -40,4 +41,4 @@ def _sift(pairing: Pairing, footage: Footage, database: Path) -> dict[str, float
             pycolmap.match_sequential(database)
         else:
             pycolmap.match_exhaustive(database)
-    return clock.seconds
+    return Filled(clock.seconds)

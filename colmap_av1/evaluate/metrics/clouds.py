@@ -46,20 +46,23 @@ def cloud_distances(
         reference: float64 [m, 3], for example the cloud of a trusted front-end.
 
     Returns:
-        The distances; None if a cloud is empty.
+        The distances; None if a cloud is empty, or the reference has no extent.
     """
     if len(points) == 0 or len(reference) == 0:
         return None
+    middle = np.quantile(reference, [0.05, 0.95], axis=0)
+    extent = float(np.linalg.norm(middle[1] - middle[0]))
+    if extent == 0:
+        return None
     to_reference, _ = KDTree(reference).query(points)
     to_points, _ = KDTree(points).query(reference)
-    middle = np.quantile(reference, [0.05, 0.95], axis=0)
     return CloudDistances(
         accuracy=float(to_reference.mean()),
         completeness=float(to_points.mean()),
         hausdorff=float(max(to_reference.max(), to_points.max())),
         mean_hausdorff=float((to_reference.max() + to_points.max()) / 2),
         robust_hausdorff=float(max(np.quantile(to_reference, 0.95), np.quantile(to_points, 0.95))),
-        extent=float(np.linalg.norm(middle[1] - middle[0])),
+        extent=extent,
     )
 
 

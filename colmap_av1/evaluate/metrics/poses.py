@@ -77,9 +77,12 @@ def fit_similarity(
     both = _in_both(cam_from_world, truth)
     if both.sum() < 3:
         return None
-    return pycolmap.estimate_sim3d(
-        camera_centres(cam_from_world[both]), camera_centres(truth[both])
-    )
+    centres, true_centres = camera_centres(cam_from_world[both]), camera_centres(truth[both])
+    shift, true_shift = _shift_off_origin(centres), _shift_off_origin(true_centres)
+    found = pycolmap.estimate_sim3d(centres + shift, true_centres + true_shift)
+    if found is None:
+        return None
+    return pycolmap.Sim3d(found.scale, found.rotation, found * shift - true_shift)
 
 
 def pose_errors(
@@ -126,6 +129,8 @@ def _robust_distances(
     centres: NDArray[np.float64], true_centres: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Distances [n] of centres after robust similarity alignment; NaN if it fails."""
+    centres = centres + _shift_off_origin(centres)
+    true_centres = true_centres + _shift_off_origin(true_centres)
     options = pycolmap.RANSACOptions(max_error=_ROBUST_ERROR, random_seed=0)
     # pycolmap's type stubs state another type than this dictionary.
     found: Any = pycolmap.estimate_sim3d_robust(centres, true_centres, options)
@@ -133,6 +138,17 @@ def _robust_distances(
         return np.full(len(centres), np.nan)
     moved = found["tgt_from_src"] * centres
     return np.asarray(np.linalg.norm(moved - true_centres, axis=1))
+
+
+def _shift_off_origin(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A shift [3] of points [n, 3] after which no plane through the origin contains them all.
+
+    COLMAP finds no similarity of points in such a plane, as the ground truth of a car often is. All
+    points on a line are in such a plane in any case.
+    """
+    mean = points.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(points - mean, full_matrices=False)
+    return np.asarray(sizes[0] * axes[-1] - mean)
 
 
 def image_poses(model: pycolmap.Reconstruction, names: Sequence[str]) -> NDArray[np.float64]:
@@ -179,7 +195,8 @@ def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
         float64 [num_frames, 3, 4] cam_from_world, NaN for frames without a line.
 
     Raises:
-        ImageError: the file cannot be read, or refers to a frame that the video lacks.
+        ImageError: the file cannot be read, or refers to a frame twice or to one that the video
+            lacks.
     """
     cam_from_world = np.full((num_frames, 3, 4), np.nan)
     try:
@@ -198,12 +215,14 @@ def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
                 f"{path}: '{words[0]}' is not one of the {num_frames} frames: give the ground "
                 "truth of this video"
             )
+        if np.isfinite(cam_from_world[frame]).all():
+            raise ImageError(f"{path}: frame {frame} occurs twice: {_WHAT_TO_GIVE}")
         try:
-            values = np.array(words[1:], dtype=np.float64)
-            rotation = Rotation.from_quat(values[3:7]).as_matrix().T
+            x, y, z, *quaternion = map(float, words[1:])
+            rotation = Rotation.from_quat(quaternion).as_matrix().T
         except ValueError as error:
             raise ImageError(f"{path}: '{line[:80]}' is not a pose: {_WHAT_TO_GIVE}") from error
-        cam_from_world[frame] = np.c_[rotation, -rotation @ values[:3]]
+        cam_from_world[frame] = np.c_[rotation, -rotation @ [x, y, z]]
     return cam_from_world
 
 

@@ -23,6 +23,7 @@ class Column:
         name: name of the front-end, with " + all tracks" if all tracks were triangulated on the
             poses of its model.
         error: why results are missing; empty if there was no error.
+        warnings: warnings about the results.
         seconds: wall time of each stage.
         cpu_seconds: CPU time of the stages "matching", "mapping" and "all tracks".
         peak_memory: largest resident memory of any stage in bytes; None if unknown.
@@ -38,6 +39,7 @@ class Column:
 
     name: str
     error: str = ""
+    warnings: tuple[str, ...] = ()
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     cpu_seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     peak_memory: int | None = None
