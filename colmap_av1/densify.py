@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +39,7 @@ from colmap_av1.images.of_videos import VideoImages, images_of_videos
 from colmap_av1.images.photos import Photo
 from colmap_av1.images.track_images import ImageChoice, TrackedImages, track_chosen_images
 from colmap_av1.options import DensifyOptions
-from colmap_av1.reconstruct import read_report
+from colmap_av1.reconstruct import REPORT
 from colmap_av1.splats.gaussians import (
     check_gaussians_path,
     initial_gaussians,
@@ -152,6 +153,12 @@ def densify(
     _check_distorted(model)
     reconstruction = read_model(model)
     posed = posed_images(reconstruction)
+    least = options.triangulate.min_observations
+    if len(posed) < least:
+        raise ModelError(
+            f"{model}: has {len(posed)} images, but points need {least} observations: give a "
+            "larger model, or a smaller --min_observations"
+        )
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
     inputs = _read_inputs(video, photos, options, posed)
     with unchanged(*inputs.states):
@@ -351,19 +358,22 @@ def _check_distorted(model: Path) -> None:
         ModelError: it is one.
     """
     folder = model.resolve()
-    if folder.parts[-2:] != ("sparse", "0"):
-        return
     # The report of further models, in OUTPUT/model_1/sparse/0, is in OUTPUT.
-    for output in folder.parents[1:3]:
-        try:
-            report = read_report(output)
-        except ModelError:  # this is no output of `reconstruct`
-            continue
-        if report.undistorted:
-            raise ModelError(
-                f"{model}: its images are undistorted, but tracks are not: run reconstruct with "
-                "other options for points, or with --undistort 0, or give the model of a mapper"
-            )
+    is_output = folder.parts[-2:] == ("sparse", "0")
+    if is_output and any(map(_has_undistorted, folder.parents[1:3])):
+        raise ModelError(
+            f"{model}: its images are undistorted, but tracks are not: run reconstruct with other "
+            "options for points, or with --undistort 0, or give the model of a mapper"
+        )
+
+
+def _has_undistorted(output: Path) -> bool:
+    """Whether a folder has the report of `reconstruct`, alone or in a batch, with undistortion."""
+    try:
+        found = json.loads((output / REPORT).read_text())
+        return bool(found.get("report", found).get("undistorted"))
+    except (OSError, ValueError, AttributeError):
+        return False
 
 
 def _read_inputs(

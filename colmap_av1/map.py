@@ -152,6 +152,7 @@ def map_database(
     except OSError as error:
         raise ModelError(cannot_write(output, error)) from error
     model = read_model(output / "0")
+    cameras = [model.cameras[i] for i in {im.camera_id for im in posed_images(model).values()}]
     unreadable = None
     with clock.measure("long range"):
         try:
@@ -163,7 +164,7 @@ def map_database(
         *placement.warnings,
         _missing(checked.num_images, num_registered),
         checked.depth.warning,
-        focal_length_warning(model.cameras.values()),
+        focal_length_warning(cameras),
         # Seams of the model are more specific than gaps of the matches.
         *(found.seam_warnings or (few_matches_warning(checked.few_match_gaps),)),
         found.long_range.warning() if found.long_range else unreadable,
@@ -328,7 +329,7 @@ def _check_input(database: Path, image_path: Path, place: PlaceOptions) -> Datab
         other = next((mark.image for mark in marks if mark.image not in names), None)
         if other is not None:
             raise OptionError(
-                f"scale: the database has no image '{other}': give its images, such as "
+                f"scale: the database has no image '{other}': name images of it, such as "
                 f"{images[0].name}"
             )
     size, wanted = image_size(files[0]), (images[0].width, images[0].height)

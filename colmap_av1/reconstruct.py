@@ -47,7 +47,7 @@ from colmap_av1.video.facts import count_shown
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import check_unchanged
 
-_REPORT = "report.json"
+REPORT = "report.json"
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,6 @@ def reconstruct(
             masks.check([own.picture_size], names, options.match.images)
     context = RunContext.of(options.match.run, clock, progress)
     with open_stages(output, "reconstruct") as stages, ExitStack() as opened:
-        _remove_earlier_layout(stages)
         sources = tuple(
             opened.enter_context(
                 open_source(
@@ -258,17 +257,6 @@ def reconstruct(
             report = replace(report, gaussians=Path(gaussians))
         _write_report(report)
     return report
-
-
-def _remove_earlier_layout(stages: Path) -> None:
-    """Remove the models that earlier versions kept in folders of the stages.
-
-    Trainers that search the whole output folder would find them.
-    """
-    for folder in (stages, *stages.parent.glob(f"model_*/{stages.name}")):
-        for name in ("poses", "placed", "adjusted", "in_place"):
-            for file in (folder / name).rglob("*.bin"):
-                file.unlink()
 
 
 def _as_converted(options: ReconstructOptions) -> MatchOptions:
@@ -413,7 +401,7 @@ def read_report(output: str | os.PathLike[str]) -> ReconstructReport:
     Raises:
         ModelError: the report is missing, damaged or from another version.
     """
-    path = Path(output) / _REPORT
+    path = Path(output) / REPORT
     try:
         return cattrs.structure(json.loads(path.read_text()), ReconstructReport)
     except (OSError, ValueError, TypeError, KeyError, cattrs.BaseValidationError) as error:
@@ -424,7 +412,7 @@ def read_report(output: str | os.PathLike[str]) -> ReconstructReport:
 
 def _write_report(report: ReconstructReport) -> None:
     text = json.dumps(dataclasses.asdict(report), indent=1, default=str)
-    path = report.output / _REPORT
+    path = report.output / REPORT
     try:
         with whole_file(path) as partial:
             partial.write_text(text + "\n")

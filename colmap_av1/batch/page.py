@@ -110,7 +110,7 @@ def write_page(output: str | os.PathLike[str], *, most_rows: int = MOST_ROWS) ->
 
 
 def _rows(into: Output, place: str) -> list[Row]:
-    """The rows of all shards, one per video; a finished row replaces a failed one."""
+    """The rows of all shards, one per video: that of the file that was written last."""
     try:
         names = batch_files(into)
     except OSError as error:
@@ -119,15 +119,15 @@ def _rows(into: Output, place: str) -> list[Row]:
         ) from error
     if not names:
         raise OptionError(f"{place}: has no {ROWS}.json: give the output of a batch")
-    rows: dict[str, Row] = {}
+    tables: list[tuple[float, list[Row]]] = []
     for name in names:
         try:
-            for row in map(row_of, json.loads(into.read(name) or b"")["rows"]):
-                if row.name not in rows or rows[row.name].state == "failed":
-                    rows[row.name] = row
-        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+            table = json.loads(into.read(name) or b"")
+            tables.append((float(table.get("time", 0)), list(map(row_of, table["rows"]))))
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise OptionError(f"{place}/{name}: damaged: run the batch again") from error
-    return list(rows.values())
+    tables.sort(key=lambda table: table[0])
+    return list({row.name: row for _, rows in tables for row in rows}.values())
 
 
 def _spreads(rows: Sequence[Row]) -> list[Mapping[str, object]]:

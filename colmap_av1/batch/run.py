@@ -18,7 +18,7 @@ from typing import Any, cast
 from colmap_av1.batch.engines import LocalEngine, RayEngine
 from colmap_av1.batch.inputs import Video, list_videos
 from colmap_av1.batch.output import ROWS, Output, output_at, scratch_for
-from colmap_av1.batch.rows import Row, csv_of, json_of
+from colmap_av1.batch.rows import Row, csv_of, json_of, row_of
 from colmap_av1.batch.video import SCRATCH, Outcome, Work, failed_row
 from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.options import BatchOptions, DensifyOptions, MatchOptions
@@ -157,6 +157,7 @@ def run_batch(
             "videos": len(everything),
         }
         rows: dict[int, Row] = {}
+        earlier = _earlier_rows(into, shard, videos)
         next_time = 0.0
         counts = Counts(len(videos))
         on_progress(counts, None)
@@ -178,12 +179,12 @@ def run_batch(
                 before = time.monotonic()
                 if before >= next_time:
                     with suppress(OptionError):
-                        _write_rows(into, shard, rows, facts)
+                        _write_rows(into, shard, {**earlier, **rows}, facts)
                     after = time.monotonic()
                     next_time = after + max(_WRITE_EVERY, (after - before) / _WRITE_SHARE)
         except BaseException:
             with suppress(OptionError):
-                _write_rows(into, shard, rows, facts)
+                _write_rows(into, shard, {**earlier, **rows}, facts)
             raise
         _write_rows(into, shard, rows, facts)
     repeated = f"ignored {num_repeated} repeated inputs"
@@ -297,10 +298,20 @@ def _write_rows(
     name = f"{ROWS}{shard}"
     try:
         output.write(f"{name}.csv", csv_of(ordered))
-        output.write(f"{name}.json", json_of(ordered, facts))
+        output.write(f"{name}.json", json_of(ordered, {**facts, "time": time.time()}))
     except OSError as error:
         path = Path(os.fsdecode(error.filename or f"{name}.csv"))
         raise OptionError(cannot_write(path, error)) from error
+
+
+def _earlier_rows(output: Output, shard: str, videos: Sequence[Video]) -> dict[int, Row]:
+    """The rows of an earlier run by index of the video, until this run has its own."""
+    try:
+        found = json.loads(output.read(f"{ROWS}{shard}.json") or b"{}").get("rows", [])
+        by_name = {row.name: row for row in map(row_of, found)}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return {}
+    return {i: by_name[video.name] for i, video in enumerate(videos) if video.name in by_name}
 
 
 def _work_of(task: Options, output: str, models: str | None, options: BatchOptions) -> Work:

@@ -60,14 +60,20 @@ class Crossings:
 
     @property
     def warning(self) -> str | None:
-        """A warning if parts of the model are joined wrongly; None if not."""
+        """A warning if the model does not fit the matches, or its parts are joined wrongly."""
         if not self.wrong:
             return None
+        most = float(self.share.max())
+        if most < _LEAST_FITTING:
+            return (
+                f"at most {most:.0%} of the matches fit the poses anywhere: give the database that "
+                "the model was mapped from, and the model of original images, not undistorted ones"
+            )
         # All matches that do not fit cross the wrong gap. Neighbouring gaps have the same number if
         # no image between them has matches.
         unfit = self.num_matches - self.num_fitting
-        most = max(int(unfit[i]) for i in self.wrong)
-        where = [i for i in self.wrong if unfit[i] == most]
+        largest = max(int(unfit[i]) for i in self.wrong)
+        where = [i for i in self.wrong if unfit[i] == largest]
         first, second = self.pairs[where[0]][0], self.pairs[where[-1]][1]
         more = len(self.wrong) - len(where)
         others = f", and few at {more} more {'place' if more == 1 else 'places'}" if more else ""

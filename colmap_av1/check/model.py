@@ -91,6 +91,7 @@ def check_model(
     """
     if not isinstance(model, pycolmap.Reconstruction):
         model = read_model(model)
+    figures = model_figures(model)
     # The long-range check comes first, because it raises if images are missing.
     long_range = None
     if image_path is not None:
@@ -101,7 +102,7 @@ def check_model(
             mapped = [name for (name,) in connection.execute("SELECT name FROM images")]
     posed = posed_model(model, with_points=True)
     return ModelCheck(
-        figures=model_figures(model),
+        figures=figures,
         seams=model_seams(posed, all_images=mapped),
         expected_error=expected_error(posed),
         crossings=None if database is None else model_crossings(model, Path(database)),

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.errors import ModelError
+from colmap_av1.geometry.colmap_model import posed_images, read_model
 from colmap_av1.geometry.coverage import coverage_of_model
 
 
@@ -41,13 +42,17 @@ def model_figures(model: pycolmap.Reconstruction | Path) -> ModelFigures:
     """Compute the figures of a model, given as pycolmap.Reconstruction or as a folder.
 
     Raises:
-        ModelError: the folder has no readable model with poses.
+        ModelError: the folder has no readable model, or the model has no poses.
     """
     if isinstance(model, Path):
         model = read_model(model)
+    posed = posed_images(model).values()
+    if not posed:
+        raise ModelError("the model has no registered image")
     errors = np.array([p.error for p in model.points3D.values()], dtype=np.float64)
     known = errors[errors >= 0]
-    focal_lengths = [camera.mean_focal_length() for camera in model.cameras.values()]
+    used = sorted({image.camera_id for image in posed})
+    focal_lengths = [model.cameras[i].mean_focal_length() for i in used]
     return ModelFigures(
         num_registered=model.num_reg_images(),
         num_points=len(errors),

@@ -272,9 +272,9 @@ def _info(namespace: argparse.Namespace) -> None:
 
 def _check(namespace: argparse.Namespace) -> int:
     if namespace.database is None and namespace.model is None:
-        raise OptionError("nothing to check: give --database, or --model with --image_path")
-    if (namespace.model is None) != (namespace.image_path is None):
-        raise OptionError("a model is checked with its images: give both --model and --image_path")
+        raise OptionError("nothing to check: give --database, or --model, or both")
+    if namespace.model is None and namespace.image_path is not None:
+        raise OptionError("images are compared with a model: give --model, too")
     good = True
     if namespace.database is not None:
         result = colmap_av1.check_database(namespace.database)
@@ -552,15 +552,15 @@ COMMANDS = {
             _path("database", "a COLMAP database", required=False),
             _path(
                 "model",
-                "folder of a COLMAP model: images far apart in time are matched and compared with "
-                "its poses; with --database also the matches that it was mapped from",
+                "folder of a COLMAP model; with --image_path, images far apart in time are matched "
+                "and compared with its poses; with --database, the matches that it was mapped from",
                 required=False,
             ),
             _optional_path("image_path", "folder of the model's images"),
             _flag(
                 "strict",
-                "exit with status 1 if the mappers cannot use the database, it is damaged, or the "
-                "model is bent",
+                "exit with status 1 if the mappers cannot use the database, it is damaged, or "
+                "there is a warning about the model",
             ),
         ),
     ),

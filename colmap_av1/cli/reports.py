@@ -114,7 +114,7 @@ def _expected_error_row(expected_error: float | None) -> Rows:
     """Expected error of the camera positions; no row if it is not known."""
     if expected_error is None:
         return []
-    return [("camera positions", f"expected error {expected_error:.3%} of their extent")]
+    return [("camera positions", f"expect errors of {expected_error:.3%} of their extent or more")]
 
 
 def reconstruct_rows(report: ReconstructReport) -> Rows:

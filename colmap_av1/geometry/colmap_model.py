@@ -25,7 +25,8 @@ from colmap_av1.util.texts import check_name
 _FILES = ("cameras", "images", "points3D")
 # Files that `map` and `densify` write to their output.
 MODEL_FILES = re.compile(
-    r"(\d+/)?(cameras|frames|images|points3D|rigs)\.(bin|txt)|mapper\.log|place\.json"
+    r"(\d+/)?(cameras|frames|images|points3D|rigs)\.(bin|txt)|(\d+/)?project\.ini"
+    r"|mapper\.log|place\.json"
 )
 
 # Records of COLMAP's binary files, little-endian and packed.

@@ -68,11 +68,17 @@ def _read_pair(
     with open_unaltered(path) as connection:
         images = dict(connection.execute("SELECT name, image_id FROM images").fetchall())
         if pair is None:
-            row = connection.execute(
-                "SELECT pair_id FROM two_view_geometries ORDER BY rows DESC, pair_id LIMIT 1"
-            ).fetchone()
+            row = None
+            for table in ("two_view_geometries", "matches"):  # the second has unverified ones, too
+                row = (
+                    row
+                    or connection.execute(
+                        f"SELECT pair_id FROM {table} WHERE rows > 0 "
+                        "ORDER BY rows DESC, pair_id LIMIT 1"
+                    ).fetchone()
+                )
             if row is None:
-                raise DatabaseError(f"{path}: has no verified pair: run 'colmap-av1 match' first")
+                raise DatabaseError(f"{path}: has no matches: run 'colmap-av1 match' first")
             ids = image_ids_from_pair_id(row[0])
         else:
             missing = next((name for name in pair if name not in images), None)

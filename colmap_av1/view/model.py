@@ -20,16 +20,16 @@ _BACKGROUND = 24
 _FAINT = 0.35
 _PATH_COLOUR = (30, 60, 230)  # BGR
 _LAST_PORT = 65535
+_PANEL_SIZE = (800, 600)  # (width, height) of each of the four views
 
 
-def view_model(model: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1200)) -> Image:
+def view_model(model: str | os.PathLike[str]) -> Image:
     """Draw the points and the camera path of a COLMAP model from three sides and obliquely.
 
     The views frame the cameras and the points with observable depth; other points are dark.
 
     Args:
         model: folder of the model (cameras, images, points3D; .bin or .txt).
-        size: (width, height) of the picture in pixels.
 
     Returns:
         uint8 [height, width, 3] BGR.
@@ -38,7 +38,6 @@ def view_model(model: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 
         ModelError: the folder has no model, or a model without poses.
     """
     scene = read_scene(model)
-    width, height = size[0] // 2, size[1] // 2
     right, up, back = scene.axes
     oblique = normalised(back - 0.5 * right + 0.7 * up)
     oblique_right = normalised(np.cross(up, oblique))
@@ -48,7 +47,7 @@ def view_model(model: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 
         ("front", right, up),
         ("side", -back, up),
     ]
-    panels = [_draw_scene(scene, title, x, y, (width, height)) for title, x, y in views]
+    panels = [_draw_scene(scene, title, x, y, _PANEL_SIZE) for title, x, y in views]
     rows = [np.concatenate(panels[i : i + 2], axis=1) for i in (0, 2)]
     return np.concatenate(rows, axis=0)
 

@@ -300,7 +300,14 @@ def test_video_without_a_model_fails(clips: Path, tmp_path: Path) -> None:
 def test_batch_densifies_the_models_of_another_batch(tmp_path: Path) -> None:
     video = PROJECT / "examples" / "scene.mp4"
     scenes, dense = tmp_path / "scenes", tmp_path / "dense"
-    options = ReconstructOptions(match=MatchOptions(images=ImageOptions(every=5)))
+    match = MatchOptions(images=ImageOptions(every=5))
+    undistorted = tmp_path / "undistorted"
+    assert (
+        run_batch(video, undistorted, ReconstructOptions(match=match), options=ONCE).num_done == 1
+    )
+    refused = run_batch(video, dense, DensifyOptions(), models=undistorted, options=ONCE)
+    assert (refused.num_done, sum(refused.failed.values())) == (0, 1)
+    options = ReconstructOptions(match=match, undistort=False)
     assert run_batch(video, scenes, options, options=ONCE).num_done == 1
     made = sorted(p.name for p in (scenes / "scene").iterdir())
     assert made == [

@@ -49,9 +49,9 @@ class Cells(html.parser.HTMLParser):
             self.tables[self._table][-1][-1] += data.strip()
 
 
-def write_rows(out: Path, rows: list[Row], name: str = "batch.json") -> None:
+def write_rows(out: Path, rows: list[Row], name: str = "batch.json", time: float = 0.0) -> None:
     out.mkdir(exist_ok=True)
-    (out / name).write_bytes(json_of(rows, {"task": "reconstruct"}))
+    (out / name).write_bytes(json_of(rows, {"task": "reconstruct", "time": time}))
 
 
 def test_page_shows_results_and_failures_of_all_shards(tmp_path: Path) -> None:
@@ -100,12 +100,15 @@ def test_page_shows_results_and_failures_of_all_shards(tmp_path: Path) -> None:
 
 
 def test_video_in_several_tables_counts_once(tmp_path: Path) -> None:
-    """The first run was one of two shards, and the second run had all videos."""
-    write_rows(tmp_path, [Row("a", "/a", "done"), Row("b", "/b", "failed")], "batch-1-of-2.json")
-    write_rows(tmp_path, [Row(n, f"/{n}", "done") for n in "abc"])
-    write_page(tmp_path)
-    text = " ".join((tmp_path / "report.html").read_text().split())
-    assert "3 videos, 3 done, 0 failed" in text
+    """One run was one of two shards, and the other run had all videos."""
+    half = [Row("a", "/a", "done"), Row("b", "/b", "failed")]
+    every = [Row(n, f"/{n}", "done") for n in "abc"]
+    for time, num_failed in ((1.0, 0), (3.0, 1)):
+        write_rows(tmp_path, half, "batch-1-of-2.json", time)
+        write_rows(tmp_path, every, time=2.0)
+        write_page(tmp_path)
+        text = " ".join((tmp_path / "report.html").read_text().split())
+        assert f"3 videos, {3 - num_failed} done, {num_failed} failed" in text
 
 
 def test_page_of_many_videos_shows_failures_first(tmp_path: Path) -> None:

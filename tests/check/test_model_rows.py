@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pycolmap
+import pytest
 
-from colmap_av1.check.model import ModelCheck
-from colmap_av1.check.model_figures import ModelFigures
+from colmap_av1.check.model import ModelCheck, check_model
+from colmap_av1.check.model_figures import ModelFigures, model_figures
 from colmap_av1.cli.reports import model_rows
+from colmap_av1.errors import ModelError
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.poses.seams import Seams
+from colmap_av1.reconstruct import ReconstructReport
 
 NONE = np.empty(0, np.int64)
 
@@ -41,3 +46,19 @@ def test_uncertain_positions_are_reported() -> None:
 def test_focal_lengths_are_printed_as_a_range() -> None:
     assert rows(319.2, 475.1)["focal lengths"] == "319.20 to 475.10 px"
     assert rows(319.2, 319.2)["focal length"] == "319.20 px"
+
+
+def test_figures_ignore_cameras_without_images(made: ReconstructReport) -> None:
+    model = read_model(made.output / "sparse" / "0")
+    before = model_figures(model)
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            camera_id=9, model="PINHOLE", width=64, height=48, params=[5000.0, 5000.0, 32.0, 24.0]
+        )
+    )
+    assert model_figures(model).focal_lengths == before.focal_lengths
+
+
+def test_model_without_poses_is_an_error() -> None:
+    with pytest.raises(ModelError, match="no registered image"):
+        check_model(pycolmap.Reconstruction())

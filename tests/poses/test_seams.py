@@ -172,6 +172,12 @@ def test_wrongly_joined_parts_are_reported(
     assert main(["check", "--strict", "--database", str(database), *words]) == _FAILED_CHECK
     assert "wrongly" in capsys.readouterr().err
 
+    for camera in model.cameras.values():
+        camera.focal_length_x = camera.focal_length_y = 3 * camera.focal_length_x
+    unfit = model_crossings(model, database).warning
+    assert unfit is not None
+    assert "undistorted" in unfit
+
 
 def _walk_with_a_turn(
     folder: Path, degrees: float, aside: float = 0, rest: int = 0, *, back: bool = False
