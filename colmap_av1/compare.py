@@ -267,7 +267,7 @@ def _run_column(
         return [replace(column, error="no image is registered: the mapper found no initial pair")]
     if not (own and options.all_tracks):
         return [column]
-    dense = replace(column, name=f"{name}{ALL_TRACKS}", num_models=1)
+    dense = replace(column, name=f"{name}{ALL_TRACKS}", num_models=1, warnings=())
     try:
         densify = DensifyOptions(match=options.match, triangulate=options.triangulate)
         made = densify_model(column.model_path, footage, folder / "all-tracks", densify)
@@ -381,7 +381,7 @@ def _measure(
         similarity = fit_similarity(poses, reference.poses)
         if similarity is None:
             lost = f"fewer than 3 poses, or poses on a line, in common with {reference.pose_source}"
-            column = replace(column, warnings=(*column.warnings, f"no errors: {lost}"))
+            column = replace(column, warnings=(*column.warnings, f"errors not measured: {lost}"))
     if similarity is not None:
         points = similarity * points
         if reference.points is not None and reference.cloud_source != column.name:

@@ -49,7 +49,7 @@ from colmap_av1.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import open_source
 from colmap_av1.util.cpus import one_blas_thread
-from colmap_av1.util.files import check_new_folder, check_outside, scratch_folder, whole_folder
+from colmap_av1.util.files import check_new_folder, scratch_folder, whole_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.kept_pictures import KeptPictures
@@ -148,7 +148,6 @@ def densify(
     read = [model, *paths_of(video), photos, folder, *options.match.files]
     # Check the outputs before the long work.
     check_new_folder(output, MODEL_FILES, read, overwrite=overwrite)
-    check_outside(output, photos)
     check_gaussians_path(gaussians, read, overwrite=overwrite)
     _check_distorted(model)
     reconstruction = read_model(model)

@@ -22,7 +22,7 @@ from colmap_av1.geometry.cameras import (
     focal_length_warning,
     with_known_focal_lengths,
 )
-from colmap_av1.images.files import alone_in, files_in
+from colmap_av1.images.files import alone_in, existing_images, files_in
 from colmap_av1.images.image_set import ImageSet, ShownVideo, pictures_of
 from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
@@ -83,7 +83,7 @@ class MatchReport:
         conversion: how videos were converted, in words; None if all are AV1.
         photos: folder of the photos; None if none was given.
         image_path: folder of the images; None if none was given.
-        densify_options: options with which `densify` reads the videos, masks and images alike.
+        densify_options: options with which `densify` reads the same videos, masks and images.
         num_frames: shown frames of the videos.
         num_coded_frames: coded frames, including hidden ones.
         num_images: images of the database.
@@ -261,8 +261,12 @@ def match(
 
     before = files_in(folder) if folder is not None else set[Path]()
     listed = _read_listed_images(database, options)
+    has_images = bool(listed)
     inputs = read_inputs(video, photos, options)
     if folder is not None:
+        has_images |= bool(before) and any(
+            existing_images(folder / label, options.images.file_name) for label in inputs.labels
+        )
         check_outside(folder, photos)
         check_places(inputs.photos, folder)
     context = RunContext.of(options.run, clock, progress)
@@ -346,7 +350,7 @@ def match(
         conversion=inputs.conversion([own.source.conversion for own in videos]),
         photos=Path(photos) if photos is not None else None,
         image_path=folder,
-        densify_options=_densify_options(given, named=folder is None and not listed),
+        densify_options=_densify_options(given, folder, has_images=has_images),
         num_frames=images.image_set.num_frames - len(inputs.photos),
         num_coded_frames=sum(own.tracked.video.num_coded_frames for own in videos),
         num_images=len(written.keypoints),
@@ -674,19 +678,23 @@ def _length_quantiles(lengths: NDArray[np.int64]) -> dict[float, int]:
     return dict(zip(_LENGTH_QUANTILES, map(int, found), strict=True))
 
 
-def _densify_options(given: MatchOptions, *, named: bool) -> DensifyOptions:
+def _densify_options(
+    given: MatchOptions, folder: Path | None, *, has_images: bool
+) -> DensifyOptions:
     """Options of `densify` on the same videos.
 
     Args:
         given: the options of this run.
-        named: whether this run chose the names of images that do not exist as files.
+        folder: the folder of the images.
+        has_images: whether there were images before this run, in the folder or in the database.
     """
-    images, first = given.images, given.images.first_number
-    if named and images.frame_list is None:
-        first = 0  # see `ImageOptions.image_name`
+    images = given.images
+    first, every = images.first_number, images.every
+    if not has_images:  # their names show the frames, see `ImageOptions.image_name`
+        first, every = 0 if folder is None and images.frame_list is None else None, None
     return DensifyOptions(
         match=MatchOptions(
-            images=ImageOptions(frame_list=images.frame_list, first_number=first),
+            images=ImageOptions(every=every, frame_list=images.frame_list, first_number=first),
             masks=given.masks,
             encode=given.encode,
             read=given.read,

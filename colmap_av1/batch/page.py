@@ -110,7 +110,7 @@ def write_page(output: str | os.PathLike[str], *, most_rows: int = MOST_ROWS) ->
 
 
 def _rows(into: Output, place: str) -> list[Row]:
-    """The rows of all shards, one per video: that of the file that was written last."""
+    """The rows of all shards, one per video: that of the run that wrote its file last."""
     try:
         names = batch_files(into)
     except OSError as error:
@@ -123,6 +123,7 @@ def _rows(into: Output, place: str) -> list[Row]:
     for name in names:
         try:
             table = json.loads(into.read(name) or b"")
+            tables.append((0.0, list(map(row_of, table.get("earlier", [])))))
             tables.append((float(table.get("time", 0)), list(map(row_of, table["rows"]))))
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise OptionError(f"{place}/{name}: damaged: run the batch again") from error

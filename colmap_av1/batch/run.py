@@ -179,12 +179,12 @@ def run_batch(
                 before = time.monotonic()
                 if before >= next_time:
                     with suppress(OptionError):
-                        _write_rows(into, shard, {**earlier, **rows}, facts)
+                        _write_rows(into, shard, rows, facts, earlier)
                     after = time.monotonic()
                     next_time = after + max(_WRITE_EVERY, (after - before) / _WRITE_SHARE)
         except BaseException:
             with suppress(OptionError):
-                _write_rows(into, shard, {**earlier, **rows}, facts)
+                _write_rows(into, shard, rows, facts, earlier)
             raise
         _write_rows(into, shard, rows, facts)
     repeated = f"ignored {num_repeated} repeated inputs"
@@ -287,18 +287,32 @@ def _next(ended: queue.SimpleQueue[Future[Outcome]]) -> Future[Outcome]:
 
 
 def _write_rows(
-    output: Output, shard: str, rows: Mapping[int, Row], facts: Mapping[str, object]
+    output: Output,
+    shard: str,
+    rows: Mapping[int, Row],
+    facts: Mapping[str, object],
+    earlier: Mapping[int, Row] = {},
 ) -> None:
     """Write the rows so far, in the order of the videos.
+
+    Args:
+        output: the output of the batch.
+        shard: part of the names of the files.
+        rows: the rows of this run, by index of the video.
+        facts: facts of this run.
+        earlier: rows of an earlier run, which remain until this run has its own.
 
     Raises:
         OptionError: they cannot be written.
     """
-    ordered = [row for _, row in sorted(rows.items())]
+    left = {i: row for i, row in earlier.items() if i not in rows}
+    ordered = [row for _, row in sorted({**left, **rows}.items())]
+    facts = {**facts, "time": time.time(), "earlier": [vars(row) for row in left.values()]}
+    own = [row for _, row in sorted(rows.items())]
     name = f"{ROWS}{shard}"
     try:
         output.write(f"{name}.csv", csv_of(ordered))
-        output.write(f"{name}.json", json_of(ordered, {**facts, "time": time.time()}))
+        output.write(f"{name}.json", json_of(own, facts))
     except OSError as error:
         path = Path(os.fsdecode(error.filename or f"{name}.csv"))
         raise OptionError(cannot_write(path, error)) from error
@@ -307,8 +321,8 @@ def _write_rows(
 def _earlier_rows(output: Output, shard: str, videos: Sequence[Video]) -> dict[int, Row]:
     """The rows of an earlier run by index of the video, until this run has its own."""
     try:
-        found = json.loads(output.read(f"{ROWS}{shard}.json") or b"{}").get("rows", [])
-        by_name = {row.name: row for row in map(row_of, found)}
+        found = json.loads(output.read(f"{ROWS}{shard}.json") or b"{}")
+        by_name = {row.name: row for key in ("earlier", "rows") for row in map(row_of, found[key])}
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return {}
     return {i: by_name[video.name] for i, video in enumerate(videos) if video.name in by_name}

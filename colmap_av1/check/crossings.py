@@ -63,8 +63,9 @@ class Crossings:
         """A warning if the model does not fit the matches, or its parts are joined wrongly."""
         if not self.wrong:
             return None
-        most = float(self.share.max())
-        if most < _LEAST_FITTING:
+        judged = self.share[self.num_matches >= _FEWEST]
+        most = float(judged.max())
+        if len(judged) > 1 and most < _LEAST_FITTING:
             return (
                 f"at most {most:.0%} of the matches fit the poses anywhere: give the database that "
                 "the model was mapped from, and the model of original images, not undistorted ones"

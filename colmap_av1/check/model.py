@@ -92,7 +92,7 @@ def check_model(
     if not isinstance(model, pycolmap.Reconstruction):
         model = read_model(model)
     figures = model_figures(model)
-    # The long-range check comes first, because it raises if images are missing.
+    # The long-range check comes before the others, because it raises if images are missing.
     long_range = None
     if image_path is not None:
         long_range = model_long_range_errors(model, Path(image_path), progress)

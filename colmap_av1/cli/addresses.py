@@ -50,8 +50,8 @@ def _is_remote(video: str | None) -> bool:
 def _fetched(url: str, folder: Path, quiet: bool) -> str:
     """A copy of a video with its remote file name, by which its images may be named."""
     address = absolute(url)
-    if not is_url(address):
-        return address
+    if not is_url(address):  # file managers copy addresses with %20 for spaces
+        return address if Path(address).exists() else unquote(address)
     folder.mkdir()
     if not quiet:
         print_note(f"fetching {without_secrets(url)}")

@@ -547,7 +547,7 @@ COMMANDS = {
     "check": Command(
         _check,
         "report whether COLMAP's mappers can use a database, or whether a model is consistent",
-        "{--database PATH | --model PATH --image_path PATH}",
+        "{--database PATH | --model PATH}",
         (
             _path("database", "a COLMAP database", required=False),
             _path(

@@ -67,12 +67,12 @@ def _check_report(path: Path, outputs: Iterable[str | None]) -> None:
 
     Raises:
         OptionError: the file cannot be created, exists and is not a report, or is one of the
-            `outputs` of the command or in one of them.
+            `outputs` of the command or lies in one.
     """
     check_creatable(path)
     for output in outputs:
         if output is not None and path.resolve().is_relative_to(Path(output).resolve()):
-            raise OptionError(f"{path}: is or is in the output {output}: give another file")
+            raise OptionError(f"{path}: lies in the output {output}: give another file")
     if not os.path.lexists(path):
         return
     found: object = None

@@ -41,6 +41,10 @@ from colmap_av1.video.unchanged import unchanged
 
 _Image = NDArray[np.uint8]
 
+# Index of the second image of an earlier run whose content is checked. Checking the last one would
+# decode the whole video.
+_CHECKED = 10
+
 
 @dataclass(frozen=True)
 class PreparedImages:
@@ -163,16 +167,17 @@ def prepare_images(
         check_image_folder(folder, names, size)
         kept = [(n, f) for n, f in zip(names, frames, strict=True) if (folder / n).exists()]
         if not existing and kept:
-            ends = dict([kept[0], kept[-1]])
+            # Another program may have numbered other frames than the pattern does.
+            some = dict([kept[0], kept[min(_CHECKED, len(kept) - 1)]])
             pictures = decode_pictures(
                 source,
                 found.tracks.num_frames,
                 options.reading,
                 display,
-                wanted=frames_near(ends.values()),
+                wanted=frames_near(some.values()),
                 context=context,
             )
-            check_content([folder / name for name in ends], list(ends.values()), pictures)
+            check_content([folder / name for name in some], list(some.values()), pictures)
     return PreparedImages(
         source=source,
         display=display,

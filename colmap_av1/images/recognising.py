@@ -192,7 +192,10 @@ def _ascending_assignment(similarity: NDArray[np.float32]) -> NDArray[np.int32]:
 
 
 def _thumbnail(image: _Image) -> NDArray[np.float32]:
-    """Grey values of a picture at low resolution minus their mean, then `_FLAT`, with norm 1."""
+    """Grey values of a picture at low resolution, and a constant that makes flat pictures similar.
+
+    The grey values have mean 0, and the vector has norm 1.
+    """
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
     small = cv2.resize(grey, (_THUMBNAIL, _THUMBNAIL), interpolation=cv2.INTER_AREA).reshape(-1)
     values = np.append(small - small.mean(), np.float32(_FLAT * _THUMBNAIL))

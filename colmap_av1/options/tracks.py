@@ -180,8 +180,8 @@ class DensityOptions(Options):
     )
     spacing: float | None = option(
         None,
-        "width in pixels of the cells of an image, at least 1, each of which selects one track; "
-        "0: no cells",
+        "width in pixels of the cells of an image, each of which selects one track; values below 1 "
+        "count as 1; 0: no cells",
         least=0,
     )
     min_images: int | None = option(

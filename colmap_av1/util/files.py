@@ -130,14 +130,14 @@ def check_apart(output: Path, inputs: Iterable[_Path | None]) -> None:
 
 
 def check_outside(output: Path, photos: _Path | None) -> None:
-    """Check that an output folder is not in the folder of the photos, which is searched for photos.
+    """Check that an output folder does not lie in the folder of the photos, which is searched.
 
     Raises:
-        OptionError: it is.
+        OptionError: it does, or is the same folder.
     """
     if photos is not None and output.resolve().is_relative_to(Path(photos).resolve()):
         raise OptionError(
-            f"{output}: is in {photos}, which is searched for photos: give a folder outside it"
+            f"{output}: lies in {photos}, which is searched for photos: give a folder outside it"
         )
 
 

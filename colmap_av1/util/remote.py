@@ -10,8 +10,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
-from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 from colmap_av1.errors import ColmapAv1Error, OptionError, VideoError
 
@@ -40,8 +38,8 @@ def is_url(address: str) -> bool:
 
 def absolute(address: str) -> str:
     """The URL or absolute path of an address, with "/" between its parts."""
-    if address.startswith("file:/"):
-        address = url2pathname(urlsplit(address).path)
+    if address.startswith("file://"):
+        address = address.removeprefix("file://")
     return address if is_url(address) else with_slashes(os.path.abspath(address))
 
 

@@ -139,7 +139,7 @@ def _encode(
     is_kept: bool,
 ) -> EncodeReport:
     """Do the work of `encode`; `is_kept` marks the output as a kept stream of the video."""
-    path, output = Path(video), Path(output).resolve()  # a link keeps leading to the output
+    path, output = Path(video), Path(output)
     if output.suffix.lower() not in _FORMATS:
         raise OptionError(f"{output}: give an output that ends in {', '.join(_FORMATS)}")
     check_new_file(output, [path], overwrite=overwrite)
@@ -147,7 +147,7 @@ def _encode(
         raise EncodeError(f"{output}: the folder does not exist: create it first")
     if not os.access(output.parent, os.W_OK | os.X_OK):
         raise EncodeError(f"{output.parent}: no permission to write there: give another output")
-    remove_leftovers(output.parent, output.name)
+    remove_leftovers(output.resolve().parent, output.resolve().name)
     file = with_counted_packets(read_video(video))
     positions = read_positions(file) if telemetry else None
     output_format = _FORMATS[output.suffix.lower()]
@@ -198,7 +198,8 @@ def _encode(
         return count
 
     try:
-        with whole_file(output) as partial, unchanged(file.state):
+        # A link keeps leading to the output.
+        with whole_file(output.resolve()) as partial, unchanged(file.state):
             count = convert(partial)
             readable = _readable_frames(file, count, strict)
             if readable < count:

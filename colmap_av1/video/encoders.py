@@ -158,7 +158,7 @@ def find_encoder(options: EncodeOptions) -> tuple[str, str]:
         tried = f"none of {', '.join(names)} works"
         remedy = "pip install imageio-ffmpeg"
         if options.speed is not None:
-            remedy = "leave out --speed, or give another one"
+            remedy += ", or leave out --speed"
         raise EncodeError(
             f"no AV1 encoder: {tried} with {' or '.join(programs) or 'any ffmpeg'} "
             f"({reasons[-1] if reasons else 'there is none'}): {remedy}"

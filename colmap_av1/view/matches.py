@@ -68,15 +68,13 @@ def _read_pair(
     with open_unaltered(path) as connection:
         images = dict(connection.execute("SELECT name, image_id FROM images").fetchall())
         if pair is None:
-            row = None
             for table in ("two_view_geometries", "matches"):  # the second has unverified ones, too
-                row = (
-                    row
-                    or connection.execute(
-                        f"SELECT pair_id FROM {table} WHERE rows > 0 "
-                        "ORDER BY rows DESC, pair_id LIMIT 1"
-                    ).fetchone()
-                )
+                row = connection.execute(
+                    f"SELECT pair_id FROM {table} WHERE rows > 0 "
+                    "ORDER BY rows DESC, pair_id LIMIT 1"
+                ).fetchone()
+                if row is not None:
+                    break
             if row is None:
                 raise DatabaseError(f"{path}: has no matches: run 'colmap-av1 match' first")
             ids = image_ids_from_pair_id(row[0])

@@ -93,6 +93,24 @@ def test_second_run_processes_changed_and_failed_videos(clips: Path, tmp_path: P
     assert changed.failed == {"damaged": 1, "unfit": 1}
 
 
+def test_interrupted_run_keeps_the_rows_of_the_others(clips: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run_batch(clips, out, ReadOptions(), options=ONCE)
+    before = [row["name"] for row in rows_of(out)]
+
+    def interrupt(counts: Counts, _: object) -> None:
+        if counts.ended == 1:
+            raise KeyboardInterrupt
+
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            run_batch(clips, out, ReadOptions(), options=ONCE, on_progress=interrupt)
+        assert [row["name"] for row in rows_of(out)] == before
+    write_page(out)
+    text = " ".join((out / "report.html").read_text().split())
+    assert f"{len(before)} videos" in text
+
+
 def test_shards_write_to_one_output(clips: Path, tmp_path: Path) -> None:
     """Two shards run at the same time, as in a job array."""
     whole, parts = tmp_path / "whole", tmp_path / "parts"

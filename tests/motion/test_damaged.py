@@ -507,10 +507,10 @@ def test_parser_recovers_after_any_damage(
     # A temporal delimiter ends an incomplete frame with an error.
     delimiter = obu(2, b"")
     for index, unit in enumerate([*split_units(data), delimiter, *split_units(whole)]):
-        position = 0
+        at = 0
         try:
-            while position < len(unit):
-                event, position = parser.parse(unit, position)
+            while at < len(unit):
+                event, at = parser.parse(unit, at)
                 if event is not None and not event.header()["show_existing_frame"]:
                     blocks, block_index, _ = event.take_blocks()
                     units = blocks.view(BLOCK)[block_index]

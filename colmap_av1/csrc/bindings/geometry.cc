@@ -96,7 +96,6 @@ nb::object correlate_patches(const Picture& one, const Positions& at_one,
   return adopt<float>(std::move(found), {at_two.shape(0), at_two.shape(1)});
 }
 
-
 nb::tuple find_patches(const InputArray<std::uint8_t, nb::ndim<3>>& patches, const Indices& index,
                        const Positions& middle,
                        const InputArray<float, nb::shape<-1, 2, 2>>& change, const Picture& target,

@@ -54,7 +54,7 @@ class TrackBuilder {
   Chainer chainer_;
   TrackStore store_;
   int num_frames_ = 0;
-  int last_display_ = -1;  // largest display index so far
+  int last_display_ = -1;  // all frames up to this display index have been output
   std::int32_t frames_chained_ = 0;
   std::int64_t next_serial_ = 0;
   std::vector<std::unique_ptr<ChainedFrame>> frames_;       // in bitstream order
