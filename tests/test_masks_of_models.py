@@ -151,12 +151,15 @@ def test_colmap_reads_the_masks_of_png_images(made: ReconstructReport, tmp_path:
 
 def test_densify_respects_masks(scene: Scene, made: ReconstructReport, tmp_path: Path) -> None:
     """Uses the masks of the images that `reconstruct` wrote."""
+    output = Path(shutil.copytree(made.output, tmp_path / "out"))
+    options = ReconstructOptions(match=masked(scene), undistort=False)
+    reconstruct(scene.video, output, options=options)
     match = MatchOptions(
-        images=ImageOptions(first_number=0), masks=MaskOptions(mask_path=made.output / "masks")
+        images=ImageOptions(first_number=0), masks=MaskOptions(mask_path=output / "masks")
     )
-    model = made.output / "sparse" / "0"
+    model = output / "sparse" / "0"
     densify(model, scene.video, tmp_path / "dense", options=DensifyOptions(match=match))
-    on_black, total = seen_on_black(tmp_path / "dense", made.output / "masks")
+    on_black, total = seen_on_black(tmp_path / "dense", output / "masks")
     assert total > 5_000
     assert on_black == 0
 

@@ -161,15 +161,6 @@ def test_no_other_file_looks_like_an_input_of_a_trainer(made: ReconstructReport)
     assert found == {"images", "sparse"}
 
 
-def test_models_in_the_stages_of_earlier_versions_are_removed(copy: Path) -> None:
-    """Brush prefers such a model: it has as many images as the finished one and a smaller path."""
-    for name in ("poses/0", "placed", "adjusted"):
-        shutil.copytree(copy / "sparse" / "0", copy / ".stages" / name)
-    assert brush(copy).model == copy / ".stages" / "adjusted"
-    reconstruct(SCENE, copy, options=OPTIONS)
-    check_files_of_trainer(brush(copy), copy)
-
-
 def test_trainer_finds_the_masks_of_the_images(copy: Path) -> None:
     masked = reconstruct(SCENE, copy, options=replace(OPTIONS, moving="mask"))
     for name, masks in brush(masked.output).masks.items():

@@ -83,7 +83,6 @@ def test_images_of_another_size_are_refused(made: ReconstructReport, tmp_path: P
     ("words", "missing"),
     [
         ([], "--database"),
-        (["--model", "m"], "--image_path"),
         (["--database", "d.db", "--image_path", "i"], "--model"),
     ],
 )

@@ -178,7 +178,7 @@ def test_match_command_reports_the_rolling_shutter(
 def test_info_command_reports_the_read_out_time(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["info", "--video", str(clip), "--quiet", "--report_json", str(tmp_path / "a.json")]
+    words = ["info", "--video", str(clip), "--report_json", str(tmp_path / "a.json")]
     assert main(words) == 0
     without = capsys.readouterr().out
     assert "rolling shutter" not in without
