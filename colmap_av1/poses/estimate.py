@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.masks import Mask
@@ -138,10 +138,12 @@ class _FurtherLinks:
         doubted: frames after doubtful seams where no links were looked for.
         loops: whether to look for loop closures, because pictures far apart in time contradict the
             poses, and none were looked for.
+        none: whether no links are used at all, because only poses with links are contradicted.
     """
 
     doubted: tuple[int, ...] = ()
     loops: bool = False
+    none: bool = False
 
 
 @dataclass(frozen=True)
@@ -161,17 +163,20 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
     """Estimate poses, and if they are doubtful estimate them again with further SIFT links.
 
     Links replace motion at doubtful seams. Loop closures are looked for if pictures far apart in
-    time contradict the poses. A model that is still poorly connected is split, see `parts`. If
-    pictures contradict only the poses with all links, those without are used: links at a fast turn
-    may follow an object that moves with the camera. If another of the mapper's models is larger
-    than the largest part, it becomes the first.
+    time contradict the poses. A model that is still poorly connected is split, see `parts`. Links
+    may follow an object that moves. If pictures contradict only the poses with further links, those
+    without these are used; if they contradict all poses with links, those without any links are
+    used, unless they contradict these as well. If another of the mapper's models is larger than the
+    largest part, it becomes the first.
     """
     options = run.options
     key = [matches_key(run, videos, image_set), options.mapping, options.moving]
     no_links = _FurtherLinks()
 
     def run_with(links: _FurtherLinks) -> Run:
-        return _with_all_links(run) if links.loops else run
+        if links.none:
+            return _with_links(run, "none")
+        return _with_links(run, "sift") if links.loops else run
 
     # The caches hold only the last result, because estimates are large. A resumed run whose
     # decisions are stored makes only the final estimate.
@@ -217,6 +222,27 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         is_large = plain.last.result.num_registered >= _LEAST_SHARE * size
         return no_links if is_large and not _is_contradicted(plain) else links
 
+    def leave_links_out(_: Path) -> _FurtherLinks:
+        posed = split(further, None)
+        may_mislead = options.match.links.links == "auto" and posed.links.num_tracks > 0
+        # Several videos, and photos, are connected by links only.
+        is_one_video = image_set.num_sequences == 1
+        if not (may_mislead and is_one_video and _is_contradicted(posed)):
+            return further
+        size = posed.last.result.num_registered
+        del posed
+        for made in (map_key_images, pose, split):
+            made.cache_clear()
+        none = _FurtherLinks(none=True)
+        try:
+            plain = split(none, None)
+        except ModelError:
+            for made in (map_key_images, pose, split):
+                made.cache_clear()
+            return further
+        is_large = plain.last.result.num_registered >= _LEAST_SHARE * size
+        return none if is_large and _is_confirmed(plain) else further
+
     def choose_model(_: Path) -> _FirstModel:
         largest_part = split(links, None)
         size = largest_part.last.result.num_registered
@@ -236,7 +262,8 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         return _FirstModel(other if is_larger and not _is_contradicted(posed) else None)
 
     first_estimate = _decided(run, "first_estimate", key, _FirstEstimate, look_for_errors)
-    links = _decided(run, "further_links", [key, first_estimate], _FurtherLinks, choose_links)
+    further = _decided(run, "further_links", [key, first_estimate], _FurtherLinks, choose_links)
+    links = _decided(run, "links", [key, further], _FurtherLinks, leave_links_out)
     first = _decided(run, "first_model", [key, links], _FirstModel, choose_model).file
     return split(links, first)
 
@@ -332,16 +359,22 @@ def _is_contradicted(posed: Posed) -> bool:
     return posed.long_range is not None and posed.long_range.result.contradicts_poses
 
 
+def _is_confirmed(posed: Posed) -> bool:
+    """Whether pictures far apart in time agree with the poses."""
+    is_seen = posed.long_range is not None and posed.long_range.result.median is not None
+    return is_seen and not _is_contradicted(posed)
+
+
 def _needs_loops(run: Run, posed: Posed) -> bool:
     """Whether pictures far apart contradict the poses, and no loop closures were looked for."""
     looked = run.options.match.links.links != "auto" or posed.matches.result.links.looked_again
     return _is_contradicted(posed) and not looked
 
 
-def _with_all_links(run: Run) -> Run:
-    """The run with loop closures in all videos."""
+def _with_links(run: Run, links: Literal["sift", "none"]) -> Run:
+    """The run with loop closures in all videos, or without links."""
     match = run.options.match
-    match = replace(match, links=replace(match.links, links="sift"))
+    match = replace(match, links=replace(match.links, links=links))
     return replace(run, options=replace(run.options, match=match))
 
 

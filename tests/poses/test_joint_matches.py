@@ -178,6 +178,23 @@ def test_links_that_images_contradict_are_not_used(
     assert report.estimate.num_registered == (joint.num_images,)
 
 
+@pytest.mark.parametrize("is_right", [False, True])
+def test_links_are_left_out_if_images_agree_only_with_poses_without_them(
+    joint: MatchReport,
+    scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    is_right: bool,
+) -> None:
+    monkeypatch.setattr(estimate, "_unlinked_seams", lambda run, image_set, posed: [30])
+    monkeypatch.setattr(estimate, "_is_contradicted", lambda posed: True)
+    monkeypatch.setattr(estimate, "_is_confirmed", lambda posed: is_right)
+    report = match(tmp_path / "a.db", scene, image_path=joint.image_path, options=OPTIONS)
+    assert (report.links.num_links == 0) == is_right
+    assert report.estimate is not None
+    assert report.estimate.num_registered == (joint.num_images,)
+
+
 def test_same_input_gives_the_same_database(
     joint: MatchReport, scene: Path, tmp_path: Path
 ) -> None:
