@@ -182,11 +182,13 @@ def _writing(output: Path) -> Iterator[None]:
 
 
 def _check_reference(output: Path, reference: str | os.PathLike[str] | None) -> None:
-    """Refuse a reference within the output, except the model of a front-end, which is kept."""
-    models = (output / _FRONTENDS).resolve()
-    if reference is not None and not Path(reference).exists():
+    """Refuse a missing reference, or one in the output except for a front-end's model."""
+    if reference is None:
+        return
+    if not Path(reference).exists():
         raise ImageError(f"{reference}: no such file or folder: give the ground truth")
-    if reference is not None and not Path(reference).resolve().is_relative_to(models):
+    models = (output / _FRONTENDS).resolve()
+    if not Path(reference).resolve().is_relative_to(models):
         check_apart(output, [reference])
 
 

@@ -39,7 +39,6 @@ from colmap_av1.images.of_videos import VideoImages, images_of_videos
 from colmap_av1.images.photos import Photo
 from colmap_av1.images.track_images import ImageChoice, TrackedImages, track_chosen_images
 from colmap_av1.options import DensifyOptions
-from colmap_av1.reconstruct import REPORT
 from colmap_av1.splats.gaussians import (
     check_gaussians_path,
     initial_gaussians,
@@ -49,7 +48,7 @@ from colmap_av1.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import open_source
 from colmap_av1.util.cpus import one_blas_thread
-from colmap_av1.util.files import check_new_folder, scratch_folder, whole_folder
+from colmap_av1.util.files import REPORT, check_new_folder, scratch_folder, whole_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.kept_pictures import KeptPictures

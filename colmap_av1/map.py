@@ -152,7 +152,6 @@ def map_database(
     except OSError as error:
         raise ModelError(cannot_write(output, error)) from error
     model = read_model(output / "0")
-    cameras = [model.cameras[i] for i in {im.camera_id for im in posed_images(model).values()}]
     unreadable = None
     with clock.measure("long range"):
         try:
@@ -164,7 +163,7 @@ def map_database(
         *placement.warnings,
         _missing(checked.num_images, num_registered),
         checked.depth.warning,
-        focal_length_warning(cameras),
+        focal_length_warning(posed_model(model).cameras.values()),
         # Seams of the model are more specific than gaps of the matches.
         *(found.seam_warnings or (few_matches_warning(checked.few_match_gaps),)),
         found.long_range.warning() if found.long_range else unreadable,

@@ -22,7 +22,7 @@ from colmap_av1.geometry.cameras import (
     focal_length_warning,
     with_known_focal_lengths,
 )
-from colmap_av1.images.files import alone_in, existing_images, files_in
+from colmap_av1.images.files import alone_in, files_in
 from colmap_av1.images.image_set import ImageSet, ShownVideo, pictures_of
 from colmap_av1.images.inputs import Inputs, read_inputs
 from colmap_av1.images.photos import check_places, place_photos
@@ -261,12 +261,8 @@ def match(
 
     before = files_in(folder) if folder is not None else set[Path]()
     listed = _read_listed_images(database, options)
-    has_images = bool(listed)
     inputs = read_inputs(video, photos, options)
     if folder is not None:
-        has_images |= bool(before) and any(
-            existing_images(folder / label, options.images.file_name) for label in inputs.labels
-        )
         check_outside(folder, photos)
         check_places(inputs.photos, folder)
     context = RunContext.of(options.run, clock, progress)
@@ -350,7 +346,7 @@ def match(
         conversion=inputs.conversion([own.source.conversion for own in videos]),
         photos=Path(photos) if photos is not None else None,
         image_path=folder,
-        densify_options=_densify_options(given, folder, has_images=has_images),
+        densify_options=_densify_options(given, folder, videos),
         num_frames=images.image_set.num_frames - len(inputs.photos),
         num_coded_frames=sum(own.tracked.video.num_coded_frames for own in videos),
         num_images=len(written.keypoints),
@@ -679,19 +675,21 @@ def _length_quantiles(lengths: NDArray[np.int64]) -> dict[float, int]:
 
 
 def _densify_options(
-    given: MatchOptions, folder: Path | None, *, has_images: bool
+    given: MatchOptions, folder: Path | None, videos: Sequence[PreparedImages]
 ) -> DensifyOptions:
     """Options of `densify` on the same videos.
 
     Args:
         given: the options of this run.
         folder: the folder of the images.
-        has_images: whether there were images before this run, in the folder or in the database.
+        videos: the images of each video.
     """
     images = given.images
     first, every = images.first_number, images.every
-    if not has_images:  # their names show the frames, see `ImageOptions.image_name`
-        first, every = 0 if folder is None and images.frame_list is None else None, None
+    if not any(own.existed for own in videos):
+        # The names of new images show their frames, see `ImageOptions.image_name`.
+        first = 0 if folder is None and images.frame_list is None else None
+        every = None
     return DensifyOptions(
         match=MatchOptions(
             images=ImageOptions(every=every, frame_list=images.frame_list, first_number=first),

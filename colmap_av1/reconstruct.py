@@ -38,7 +38,7 @@ from colmap_av1.splats.reconstruct_model import ModelResult
 from colmap_av1.splats.reconstruct_models import FurtherModel, further_models, written_model
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.cpus import one_blas_thread
-from colmap_av1.util.files import check_apart, check_outside, scratch_folder, whole_file
+from colmap_av1.util.files import REPORT, check_apart, check_outside, scratch_folder, whole_file
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import open_stages
@@ -46,8 +46,6 @@ from colmap_av1.util.texts import some_names
 from colmap_av1.video.facts import count_shown
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import check_unchanged
-
-REPORT = "report.json"
 
 
 @dataclass(frozen=True)

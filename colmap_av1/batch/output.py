@@ -14,11 +14,9 @@ from typing import Any
 
 from colmap_av1.batch.rows import json_text
 from colmap_av1.errors import OptionError, cannot_write
-from colmap_av1.util.files import only_run, remove_leftovers, whole_file
+from colmap_av1.util.files import REPORT, only_run, remove_leftovers, whole_file
 from colmap_av1.util.remote import filesystem, is_url
 
-# Marks the folder of a video as complete.
-REPORT = "report.json"
 # Names in the output that no video may use.
 HIDDEN = ".batch"
 ROWS, PAGE = "batch", "report.html"

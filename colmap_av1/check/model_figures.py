@@ -9,8 +9,9 @@ import numpy as np
 import pycolmap
 
 from colmap_av1.errors import ModelError
-from colmap_av1.geometry.colmap_model import posed_images, read_model
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.coverage import coverage_of_model
+from colmap_av1.geometry.posed_model import posed_model
 
 
 @dataclass(frozen=True)
@@ -46,13 +47,12 @@ def model_figures(model: pycolmap.Reconstruction | Path) -> ModelFigures:
     """
     if isinstance(model, Path):
         model = read_model(model)
-    posed = posed_images(model).values()
-    if not posed:
+    posed = posed_model(model)
+    if not posed.images:
         raise ModelError("the model has no registered image")
     errors = np.array([p.error for p in model.points3D.values()], dtype=np.float64)
     known = errors[errors >= 0]
-    used = sorted({image.camera_id for image in posed})
-    focal_lengths = [model.cameras[i].mean_focal_length() for i in used]
+    focal_lengths = [camera.mean_focal_length() for camera in posed.cameras.values()]
     return ModelFigures(
         num_registered=model.num_reg_images(),
         num_points=len(errors),

@@ -40,6 +40,7 @@ from colmap_av1.options import (
     ViewOptions,
 )
 from colmap_av1.options.fields import Options
+from colmap_av1.util.files import REPORT
 
 _FAILED_CHECK = 1
 # A trainer failed on a model.
@@ -381,7 +382,7 @@ def _view_page(namespace: argparse.Namespace) -> None:
     model, report = Path(namespace.model), None
     check_page(namespace.output, [model], overwrite=namespace.overwrite)
     folder = model.resolve().parent.parent
-    if model.resolve() == folder / "sparse" / "0" and (folder / "report.json").exists():
+    if model.resolve() == folder / "sparse" / "0" and (folder / REPORT).exists():
         try:
             report = read_report(folder)
         except ModelError as error:

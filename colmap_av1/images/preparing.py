@@ -56,6 +56,7 @@ class PreparedImages:
         tracked: the tracks, in pixels of the images, and the images.
         size: (width, height) of the images.
         pixel_aspect: width of the images' pixels over their height.
+        existed: whether there were images, so that their names need not show the frames.
     """
 
     source: VideoSource
@@ -63,6 +64,7 @@ class PreparedImages:
     tracked: TrackedImages
     size: tuple[int, int]
     pixel_aspect: float
+    existed: bool
 
 
 @dataclass(frozen=True)
@@ -184,6 +186,7 @@ def prepare_images(
         tracked=found.with_tracks(found.tracks.scale_to(size)),
         size=size,
         pixel_aspect=fit.pixel_aspect,
+        existed=bool(existing),
     )
 
 

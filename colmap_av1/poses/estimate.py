@@ -192,6 +192,11 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
     def split(links: _FurtherLinks, first: str | None) -> Posed:
         return split_at_seams(run_with(links), pose(links, first), image_set)
 
+    def forget() -> None:
+        """Clear the caches: after an error, the stages on disk are those of other links."""
+        for made in (map_key_images, pose, split):
+            made.cache_clear()
+
     def look_for_errors(_: Path) -> _FirstEstimate:
         posed = pose(no_links, None)
         links = _FurtherLinks(
@@ -208,9 +213,7 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         try:
             posed = split(links, None)
         except ModelError:  # the poses without them can be used
-            # The stages on disk are those with the links, and must be made again.
-            for made in (map_key_images, pose, split):
-                made.cache_clear()
+            forget()
             return no_links
         if not first_estimate.may_be_right or not _is_contradicted(posed):
             return links
@@ -231,14 +234,12 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
             return further
         size = posed.last.result.num_registered
         del posed
-        for made in (map_key_images, pose, split):
-            made.cache_clear()
+        forget()
         none = _FurtherLinks(none=True)
         try:
             plain = split(none, None)
         except ModelError:
-            for made in (map_key_images, pose, split):
-                made.cache_clear()
+            forget()
             return further
         is_large = plain.last.result.num_registered >= _LEAST_SHARE * size
         return none if is_large and _is_confirmed(plain) else further

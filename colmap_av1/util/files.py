@@ -29,6 +29,8 @@ except ImportError:  # Windows has no fcntl
 
 _Path = str | os.PathLike[str]
 
+# Report of a run in its output folder. In a batch, it marks the folder of a video as complete.
+REPORT = "report.json"
 # Locks of some cluster file systems are visible on one machine only, so each machine removes only
 # its own leftovers.
 _OURS = f"colmap-av1-{zlib.crc32(socket.gethostname().encode()) & 0xFFFF:04x}"

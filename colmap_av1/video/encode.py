@@ -147,7 +147,8 @@ def _encode(
         raise EncodeError(f"{output}: the folder does not exist: create it first")
     if not os.access(output.parent, os.W_OK | os.X_OK):
         raise EncodeError(f"{output.parent}: no permission to write there: give another output")
-    remove_leftovers(output.resolve().parent, output.resolve().name)
+    target = output.resolve()  # a link keeps leading to the output
+    remove_leftovers(target.parent, target.name)
     file = with_counted_packets(read_video(video))
     positions = read_positions(file) if telemetry else None
     output_format = _FORMATS[output.suffix.lower()]
@@ -198,8 +199,7 @@ def _encode(
         return count
 
     try:
-        # A link keeps leading to the output.
-        with whole_file(output.resolve()) as partial, unchanged(file.state):
+        with whole_file(target) as partial, unchanged(file.state):
             count = convert(partial)
             readable = _readable_frames(file, count, strict)
             if readable < count:

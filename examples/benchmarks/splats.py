@@ -94,13 +94,14 @@ def folder_of(clip: Clip, folder: Path, way: str) -> tuple[Path, Path]:
     """The undistorted images and model of a clip by one way."""
     if way == DROP_IN:
         given: list[Any] = [file_digest(clip.video), clip.images, clip.camera]
-        return undistorted(folder / "splats" / "match", given, lambda output: match(clip, output))
+        output = folder / "splats" / "match"
+        return undistorted(output, given, lambda: match(clip, output))
     *_, output = phone_to_folder.folder_of(clip, folder / "reconstruct")
     if way != SIFT:
         return output / "images", output / "sparse" / "0"
     names = sorted(path.name for path in (output / "images").iterdir())
 
-    def sift(_folder: Path) -> tuple[Path, Path]:
+    def sift() -> tuple[Path, Path]:
         _steps, model, pictures = phone_to_folder.sift_of(clip, folder / "sift", names, mapped=True)
         if model is None:
             raise SystemExit(f"{clip.name}: SIFT made no model")
@@ -122,13 +123,13 @@ def match(clip: Clip, folder: Path) -> tuple[Path, Path]:
 
 
 def undistorted(
-    folder: Path, given: list[Any], make: Callable[[Path], tuple[Path, Path]]
+    folder: Path, given: list[Any], make: Callable[[], tuple[Path, Path]]
 ) -> tuple[Path, Path]:
     """The undistorted images and model that `make` returns, made once for the same `given`."""
     images, model = folder / "images", folder / "model"
 
     def run() -> dict[str, Any]:
-        pictures, distorted = make(folder)
+        pictures, distorted = make()
         images.mkdir()
         undistort_images(distorted, pictures, images)
         undistort_model(distorted, model)

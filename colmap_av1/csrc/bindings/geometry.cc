@@ -80,8 +80,7 @@ geometry::GreyPicture grey_picture(const Picture& pixels) {
           .height = static_cast<std::int64_t>(pixels.shape(0))};
 }
 
-nb::object correlate_patches(const Picture& one, const Positions& at_one,
-                             const Picture& two,
+nb::object correlate_patches(const Picture& one, const Positions& at_one, const Picture& two,
                              const InputArray<float, nb::shape<-1, -1, 2>>& at_two,
                              float min_deviation) {
   if (at_one.shape(0) != at_two.shape(0)) {
