@@ -93,7 +93,9 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
             adjustment.ceres.solver_options.function_tolerance = settings["tolerance"]
         models = pycolmap.global_mapping(database, each, each, options=global_options)
     shutil.rmtree(each)
-    found = sorted(models.values(), key=lambda m: -m.num_reg_images())
+    # The mapper keeps the images of a model even if it removes all of its points.
+    useful = [model for model in models.values() if model.num_points3D() > 0]
+    found = sorted(useful, key=lambda m: -m.num_reg_images())
     for number, model in enumerate(found):
         if settings["image_path"] is not None:
             model.extract_colors_for_all_images(settings["image_path"])
