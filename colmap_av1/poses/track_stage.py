@@ -126,7 +126,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
                 tracking,
                 ImageChoice(options.images, folder=partial),
                 masks=run.inputs.masks_of_videos[video],
-                every_frame=True,
+                every_frame=options.camera.rolling_shutter != "none",
                 context=run.context,
             )
         chosen, tracked = found.chosen, found.video
@@ -302,4 +302,4 @@ def tracks_of(file: Any) -> Tracks:
 
 def pose_tracks(run: Run, tracks: Tracks) -> Tracks:
     """The tracks that poses are estimated from; shorter ones are used for points only."""
-    return tracks.keep_long(least_length(run.options.match.tracks))
+    return tracks.keep_lasting(least_length(run.options.match.tracks))

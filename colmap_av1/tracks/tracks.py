@@ -200,6 +200,11 @@ class Tracks:
         """Keep the tracks with at least `min_length` observations."""
         return self.keep_tracks(self.lengths >= min_length)
 
+    def keep_lasting(self, num_frames: int) -> Tracks:
+        """Keep the tracks that reach over at least `num_frames` frames, observed or not."""
+        last = self.offsets[1:] - 1
+        return self.keep_tracks(self.frame[last] - self.frame[self.offsets[:-1]] >= num_frames - 1)
+
     def keep_observed_in(self, frames: NDArray[np.int32], min_frames: int) -> Tracks:
         """Keep the whole tracks that are observed in at least `min_frames` of these frames."""
         counted = np.zeros(self.num_frames, dtype=np.bool_)

@@ -678,9 +678,16 @@ def test_long_tracks_are_kept() -> None:
     tracks = build_tracks(frames, TrackOptions(min_length=1, border=None))
     assert set(tracks.lengths) > {1, 2, 8}
     longer = build_tracks(frames, TrackOptions(min_length=4, border=None))
-    kept = tracks.keep_long(4)
-    for name in ("offsets", "frame", "xy", "sigma"):
-        assert np.array_equal(getattr(kept, name), getattr(longer, name))
+    for kept in (tracks.keep_long(4), tracks.keep_lasting(4)):
+        for name in ("offsets", "frame", "xy", "sigma"):
+            assert np.array_equal(getattr(kept, name), getattr(longer, name))
+
+
+def test_tracks_last_even_if_few_frames_are_kept() -> None:
+    tracks = build_tracks(low_delay([(3.0, 0.0)] * 7), TrackOptions(min_length=1, border=None))
+    ends = tracks.keep_frames(np.array([0, 3], np.int32))
+    assert ends.keep_lasting(4).num_tracks == np.count_nonzero(ends.lengths == 2) > 0
+    assert ends.keep_lasting(5).num_tracks == 0
 
 
 # trust
