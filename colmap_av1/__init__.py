@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         NotAv1Error,
         OptionError,
         VideoError,
+        WriteError,
     )
     from colmap_av1.interop.hloc import HlocMatches, export_hloc, read_hloc
     from colmap_av1.map import MapReport, map_database
@@ -119,6 +120,7 @@ __all__ = [
     "VerifyOptions",
     "VideoError",
     "ViewOptions",
+    "WriteError",
     "build_tracks",
     "check_database",
     "check_model",

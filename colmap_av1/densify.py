@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from colmap_av1.errors import ModelError, cannot_write
+from colmap_av1.errors import ModelError, WriteError, cannot_write
 from colmap_av1.geometry.colmap_model import (
     MODEL_FILES,
     ModelImage,
@@ -126,8 +126,8 @@ def densify(
         overwrite: replace an output that holds only a model, and a file of Gaussians.
 
     Raises:
-        ModelError: the model is not readable, has no poses, or is not of these videos, or the
-            dense model cannot be written.
+        ModelError: the model is not readable, has no poses, or is not of these videos.
+        WriteError: the dense model cannot be written.
         VideoError: a video cannot be read, is given twice, or changes during the run.
         BitstreamError: a stream is damaged, and `strict` is set or the damage is before the
             second frame.
@@ -316,7 +316,7 @@ def _write(
         with whole_folder(output, MODEL_FILES if overwrite else None) as partial:
             write_model(partial, cameras, images, points)
     except OSError as error:
-        raise ModelError(cannot_write(output, error)) from error
+        raise WriteError(cannot_write(output, error)) from error
 
 
 def _write_gaussians(

@@ -49,6 +49,10 @@ class ModelError(ColmapAv1Error):
     """The COLMAP model is missing, unreadable, without poses, or not of this video."""
 
 
+class WriteError(ColmapAv1Error):
+    """A file of a run or a model cannot be written, for example because the disk is full."""
+
+
 class OptionError(ColmapAv1Error):
     """An option has an invalid value."""
 

@@ -18,7 +18,14 @@ from colmap_av1.check.model import check_model, uncertainty_warning
 from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_images, read_pose_priors
-from colmap_av1.errors import DatabaseError, ImageError, ModelError, OptionError, cannot_write
+from colmap_av1.errors import (
+    DatabaseError,
+    ImageError,
+    ModelError,
+    OptionError,
+    WriteError,
+    cannot_write,
+)
 from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.geometry.posed_model import posed_model
@@ -112,6 +119,7 @@ def map_database(
         ImageError: an image of the database is missing from the folder, or the first one differs in
             size.
         ModelError: the mapper fails or finds no model; the message names its log.
+        WriteError: the output cannot be written.
         OptionError: the output is not empty and must not be replaced, or the database lacks an
             image of the known distance.
 
@@ -150,7 +158,7 @@ def map_database(
                     )
                 write_place(partial, placement)
     except OSError as error:
-        raise ModelError(cannot_write(output, error)) from error
+        raise WriteError(cannot_write(output, error)) from error
     model = read_model(output / "0")
     unreadable = None
     with clock.measure("long range"):

@@ -13,7 +13,7 @@ from pathlib import Path
 import cattrs
 import numpy as np
 
-from colmap_av1.errors import ColmapAv1Error, ModelError, cannot_write
+from colmap_av1.errors import ColmapAv1Error, ModelError, WriteError, cannot_write
 from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.geometry.track_points import LEAST_AGREEING
@@ -194,7 +194,8 @@ def reconstruct(
         BitstreamError: a stream is damaged, and `strict` is set or the damage is before the
             second frame.
         ImageError: images cannot be chosen or written.
-        ModelError: no poses are found, or the output cannot be written.
+        ModelError: no poses are found.
+        WriteError: the output cannot be written.
         OptionError: an option does not fit the video, the folder has other contents, or the file
             of Gaussians cannot be made.
 
@@ -415,4 +416,4 @@ def _write_report(report: ReconstructReport) -> None:
         with whole_file(path) as partial:
             partial.write_text(text + "\n")
     except OSError as error:
-        raise ModelError(cannot_write(path, error)) from error
+        raise WriteError(cannot_write(path, error)) from error

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from colmap_av1.errors import ModelError
+from colmap_av1.errors import ModelError, WriteError
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.matching.mapper_limits import FORWARD_MOTION
 from colmap_av1.options import MapOptions
@@ -77,6 +77,7 @@ def map_poses(
 
     Raises:
         ModelError: the mapper failed; the log holds the details.
+        WriteError: the models are incomplete.
     """
     output.mkdir(parents=True, exist_ok=True)
     settings = _mapping_settings(database, output, options, image_path)
@@ -218,6 +219,7 @@ def adjust_model(
 
     Raises:
         ModelError: the adjustment failed; the log holds the details.
+        WriteError: the model is incomplete.
     """
     settings = {
         "task": "adjustment",
@@ -239,7 +241,7 @@ def _check_whole(model: Path) -> None:
     try:
         read_model(model)
     except ModelError as error:
-        raise ModelError(
+        raise WriteError(
             f"{model}: is incomplete: make sure that the disk has space, and run the same command "
             "again"
         ) from error

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ModelError, OptionError, cannot_write
+from colmap_av1.errors import OptionError, WriteError, cannot_write
 from colmap_av1.geometry.colmap_model import (
     ModelPoints,
     camera_centres,
@@ -194,7 +194,7 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
         gaussians: the Gaussians.
 
     Raises:
-        ModelError: the file cannot be written.
+        WriteError: the file cannot be written.
     """
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(_REST)]
@@ -209,7 +209,7 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
             for first in range(0, len(gaussians.xyz), _CHUNK):
                 file.write(_records(gaussians, slice(first, first + _CHUNK)).tobytes())
     except OSError as error:
-        raise ModelError(cannot_write(path, error)) from error
+        raise WriteError(cannot_write(path, error)) from error
 
 
 def write_model_gaussians(path: Path, model: Path) -> None:
@@ -220,7 +220,8 @@ def write_model_gaussians(path: Path, model: Path) -> None:
         model: folder of the model.
 
     Raises:
-        ModelError: the model cannot be read, or the file cannot be written.
+        ModelError: the model cannot be read.
+        WriteError: the file cannot be written.
     """
     reconstruction = read_model(model)
     posed = sorted(posed_images(reconstruction).values(), key=lambda image: image.name)

@@ -15,6 +15,7 @@ from colmap_av1.errors import (
     ModelError,
     NotAv1Error,
     VideoError,
+    WriteError,
 )
 
 # System errors that the next attempt will meet again.
@@ -33,6 +34,7 @@ _REASONS: tuple[tuple[type[Exception], str], ...] = (
     (VideoError, "unreadable"),
     (EncodeError, "not converted"),
     (ModelError, "no model"),
+    (WriteError, "reading or writing"),
     (ColmapAv1Error, "unfit"),
 )
 

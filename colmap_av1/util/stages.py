@@ -22,7 +22,7 @@ from typing import Any, Generic, TypeVar
 
 import cattrs
 
-from colmap_av1.errors import ModelError, OptionError, cannot_write
+from colmap_av1.errors import OptionError, WriteError, cannot_write
 from colmap_av1.util.digests import (
     code_digest,
     digest_of,
@@ -124,7 +124,7 @@ def run_stage(
         into: folder for the products; None: the folder of the stages.
 
     Raises:
-        ModelError: a file cannot be written.
+        WriteError: a file cannot be written.
         OptionError: a user's file is in the way.
     """
     into = into or stages
@@ -144,7 +144,7 @@ def run_stage(
     except OSError as error:
         if error.filename is not None and stages.parent not in Path(error.filename).parents:
             raise  # an input could not be read
-        raise ModelError(
+        raise WriteError(
             f"{into}: cannot be written: {error.strerror or error}: fix that and run the same "
             "command again, finished stages are kept"
         ) from error

@@ -10,7 +10,7 @@ from dense_scene import NUM_IMAGES, Truth
 from scipy.spatial.transform import Rotation
 from sequences import model_poses
 
-from colmap_av1.errors import ModelError
+from colmap_av1.errors import ModelError, WriteError
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import read_model, write_model
 from colmap_av1.geometry.posed_model import posed_model, read_posed_model
@@ -136,7 +136,7 @@ def test_full_disk_is_reported(made: ReconstructReport, tmp_path: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
     try:
-        with pytest.raises(ModelError, match="disk"):
+        with pytest.raises(WriteError, match="disk"):
             mapper_module.adjust_model(
                 tmp_path / "model",
                 refine_intrinsics=False,

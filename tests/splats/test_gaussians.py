@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_av1.errors import ModelError, OptionError
+from colmap_av1.errors import OptionError, WriteError
 from colmap_av1.geometry.colmap_model import ModelPoints
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.splats.gaussians import (
@@ -134,7 +134,7 @@ def test_unusable_output_paths_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="cannot be created"):
         check_gaussians_path(tmp_path / "file" / "init.ply", [])
     empty = Gaussians(*(np.empty((0, k)) for k in (3, 3, 3, 4)), np.empty(0), np.empty((0, 3)))
-    with pytest.raises(ModelError, match="cannot be written"):
+    with pytest.raises(WriteError, match="cannot be written"):
         write_gaussians(tmp_path / "file" / "init.ply", empty)
     assert {p.name for p in tmp_path.iterdir()} == {"folder.ply", "file"}
     made = tmp_path / "made.ply"
