@@ -6,10 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import count
-from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from colmap_av1.errors import ModelError
+from colmap_av1.errors import ModelError, VideoError
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.image_set import ImageSet
@@ -18,6 +17,7 @@ from colmap_av1.poses.dynamic.stage import (
     DynamicResult,
     dynamic_stage,
     read_dynamic_masks,
+    without_dynamic_links,
     without_dynamic_tracks,
 )
 from colmap_av1.poses.long_range_stage import LongRangeResult, long_range_stage
@@ -58,8 +58,9 @@ class Posed:
         resection: the poses of the images in between; None if all images are key images.
         dynamic: the dynamic objects; None if they were not looked for.
         adjustment: the adjusted poses; None if they are not adjusted.
-        tracks: the tracks of all videos, cut at gaps that links replace.
-        links: links as tracks.
+        tracks: the tracks of all videos, cut at gaps that links replace and at seams of splits,
+            without dynamic pixels.
+        links: links as tracks, without dynamic pixels.
         dynamic_masks: masks that exclude dynamic objects, by image name.
         has_picture_positions: whether tracks have positions in the pictures; false if they were
             corrected for a rolling shutter.
@@ -170,7 +171,7 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
     largest part, it becomes the first.
     """
     options = run.options
-    key = [matches_key(run, videos, image_set), options.mapping, options.moving]
+    key = [matches_key(run, videos, image_set), options.mapping, options.moving != "keep"]
     no_links = _FurtherLinks()
 
     def run_with(links: _FurtherLinks) -> Run:
@@ -197,7 +198,7 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         for made in (map_key_images, pose, split):
             made.cache_clear()
 
-    def look_for_errors(_: Path) -> _FirstEstimate:
+    def look_for_errors() -> _FirstEstimate:
         posed = pose(no_links, None)
         links = _FurtherLinks(
             doubted=tuple(_unlinked_seams(run, image_set, posed)),
@@ -206,7 +207,7 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         may_be_right = not _is_contradicted(posed) or bool(_seams_to_split(posed))
         return _FirstEstimate(links, may_be_right)
 
-    def choose_links(_: Path) -> _FurtherLinks:
+    def choose_links() -> _FurtherLinks:
         links = first_estimate.links
         if links == no_links:
             return no_links
@@ -225,7 +226,7 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         is_large = plain.last.result.num_registered >= _LEAST_SHARE * size
         return no_links if is_large and not _is_contradicted(plain) else links
 
-    def leave_links_out(_: Path) -> _FurtherLinks:
+    def leave_links_out() -> _FurtherLinks:
         posed = split(further, None)
         may_mislead = options.match.links.links == "auto" and posed.links.num_tracks > 0
         # Several videos, and photos, are connected by links only.
@@ -238,13 +239,13 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         none = _FurtherLinks(none=True)
         try:
             plain = split(none, None)
-        except ModelError:
+        except (ModelError, VideoError):  # without links, there may be nothing to match
             forget()
             return further
         is_large = plain.last.result.num_registered >= _LEAST_SHARE * size
         return none if is_large and _is_confirmed(plain) else further
 
-    def choose_model(_: Path) -> _FirstModel:
+    def choose_model() -> _FirstModel:
         largest_part = split(links, None)
         size = largest_part.last.result.num_registered
         if largest_part is pose(links, None):  # it was not split
@@ -274,10 +275,10 @@ def _decided(
     name: str,
     key: Sequence[Any],
     kind: type[_Decision],
-    make: Callable[[Path], _Decision],
+    make: Callable[[], _Decision],
 ) -> _Decision:
     """The result of a stage without products."""
-    return run_stage(run.stages, name, key, kind, products=[], make=make).result
+    return run_stage(run.stages, name, key, kind, products=[], make=lambda _: make()).result
 
 
 def _larger_model(run: Run, mapped: _Mapped, size: int, image_set: ImageSet) -> str | None:
@@ -368,7 +369,7 @@ def _is_confirmed(posed: Posed) -> bool:
 
 def _needs_loops(run: Run, posed: Posed) -> bool:
     """Whether pictures far apart contradict the poses, and no loop closures were looked for."""
-    looked = run.options.match.links.links != "auto" or posed.matches.result.links.looked_again
+    looked = run.options.match.links.links != "auto" or posed.matches.result.links.searched_all
     return _is_contradicted(posed) and not looked
 
 
@@ -454,7 +455,7 @@ def _long_range_check(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongR
         posed.dynamic_masks,
         posed.last,
         masked=posed.masks_digest,
-        linked=posed.matches.result.links.looked_again,
+        linked=posed.matches.result.links.searched_all,
     )
 
 
@@ -551,9 +552,8 @@ def refined_poses(
     if run.options.moving != "keep":
         dynamic = dynamic_stage(run, tracks, image_set, poses)
         dynamic_masks = read_dynamic_masks(run.stages)
-    tracks, links = (
-        without_dynamic_tracks(own, image_set, dynamic_masks, run) for own in (tracks, links)
-    )
+    tracks = without_dynamic_tracks(tracks, image_set, dynamic_masks, run)
+    links = without_dynamic_links(links, image_set, dynamic_masks)
     posed = Posed(
         matches=matched,
         mapped=mapped,

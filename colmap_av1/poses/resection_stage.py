@@ -51,7 +51,7 @@ def resection_stage(
     return run_stage(
         run.stages,
         "resection",
-        [posed.digest, run.context.seed],
+        [posed.digest, image_set.images.names, run.context.seed],
         PosesResult,
         products=["placed.npz"],
         make=make,
@@ -78,22 +78,23 @@ def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -
         left = np.setdiff1d(image_set.images.frames[images.start : images.stop], frames)
         if len(left) == 0:
             continue
-        camera_id = known.images[own[0]].camera_id
-        camera = known.cameras[camera_id]
+        nearest = own[np.abs(frames[:, None] - left).argmin(axis=0)]
+        camera_ids = [known.images[i].camera_id for i in nearest]
+        cameras = [known.cameras[camera_id] for camera_id in camera_ids]
         guesses = interpolate_poses(
             np.array([known.images[i].cam_from_world for i in own]), frames, left
         )
         found = resect(
-            sightings_of(points, seen, spread, left, [camera] * len(left)),
+            sightings_of(points, seen, spread, left, cameras),
             guesses,
-            np.full(len(left), camera.mean_focal_length()),
+            np.array([camera.mean_focal_length() for camera in cameras]),
             seed=run.context.seed,
             num_threads=run.context.num_threads,
             progress=progress_in(run.progress, "resection", len(left)),
         )
         pose_of |= {
             frame: (camera_id, pose)
-            for frame, pose in zip(left.tolist(), found, strict=True)
+            for frame, camera_id, pose in zip(left.tolist(), camera_ids, found, strict=True)
             if pose is not None
         }
     return [

@@ -28,7 +28,8 @@ from colmap_av1.geometry.triangulation import (
     Views,
     triangulate,
 )
-from colmap_av1.images.image_set import ShownVideo
+from colmap_av1.images.choosing import ChosenImages
+from colmap_av1.images.image_set import ShownVideo, count_through
 from colmap_av1.images.masks import mask_tracks
 from colmap_av1.options import (
     CameraOptions,
@@ -42,6 +43,7 @@ from colmap_av1.poses.dynamic.contradictions import Contradictions, PlacedTracks
 from colmap_av1.poses.dynamic.following import expect_in_views, follow_behind
 from colmap_av1.poses.dynamic.regions import dynamic_cells, shares_above_usual, strong_patches
 from colmap_av1.poses.dynamic.short_tracks import static_points
+from colmap_av1.poses.dynamic.stage import without_dynamic_links
 from colmap_av1.poses.posed_images import PosedImages
 from colmap_av1.poses.run import Run
 from colmap_av1.reconstruct import reconstruct
@@ -220,6 +222,28 @@ def test_weak_patches_are_dropped_from_the_dynamic_regions() -> None:
     found = strong_patches(cells, share)
     assert found[:, 2:10, 3:9].all()
     assert found.sum() == 2 * 8 * 6
+
+
+def test_objects_that_move_between_two_images_do_not_separate_their_links() -> None:
+    """A link says nothing about the frames between its observations, unlike a track of motion."""
+    kept = np.ones((HEIGHT, WIDTH), np.bool_)
+    kept[:, 100:200] = False
+    images = ChosenImages([str(i) for i in range(10)], np.arange(10, dtype=np.int32))
+    image_set = count_through([""], [images], [10])
+    links = Tracks(
+        num_frames=10,
+        width=WIDTH,
+        height=HEIGHT,
+        offsets=np.array([0, 3, 5, 7]),
+        frame=np.array([0, 5, 9, 0, 9, 5, 9], np.int32),
+        xy=np.array([[x, 50] for x in (50, 150, 250, 50, 250, 150, 250)], np.float32),
+        sigma=np.zeros(7, np.float32),
+        confirmed=np.ones(7, np.bool_),
+    )
+    masks = {str(i): make_mask(kept) for i in range(4, 7)}
+    left = without_dynamic_links(links, image_set, masks)
+    assert left.frame.tolist() == [0, 9, 0, 9]
+    assert left.offsets.tolist() == [0, 2, 4]
 
 
 def test_points_of_few_images_are_static_if_one_image_shows_no_motion() -> None:

@@ -31,6 +31,8 @@ _CELL = 8
 _USUAL_WIDTH = 960
 # Fewest images of a track that is examined, and of a video.
 _MIN_IMAGES = 4
+# Fewest images of a link.
+_MIN_LINKED = 2
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,23 @@ def without_dynamic_tracks(
         return tracks
     options = chaining_for_points(run.options.match.tracks, run.options.triangulate)
     return mask_tracks(tracks, by_frame, least_length(options), scaled=False)
+
+
+def without_dynamic_links(
+    links: Tracks, image_set: ImageSet, dynamic_masks: Mapping[str, Mask]
+) -> Tracks:
+    """The links without observations on dynamic pixels.
+
+    Unlike a track of motion, a link says nothing about the frames between two of its observations.
+    """
+    images = image_set.images
+    kept = np.ones(links.num_observations, np.bool_)
+    order, bounds = links.by_frame()
+    for frame, name in zip(images.frames.tolist(), images.names, strict=True):
+        if name in dynamic_masks:
+            mask, own = dynamic_masks[name], order[bounds[frame] : bounds[frame + 1]]
+            kept[own] = mask.keeps(links.xy[own], mask.size)
+    return links.keep_observations(kept).keep_long(_MIN_LINKED)
 
 
 def _write(path: Path, masks: Mapping[str, Mask]) -> None:
