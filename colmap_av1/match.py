@@ -30,7 +30,7 @@ from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_prepared
 from colmap_av1.images.recognising import check_content, frames_near
 from colmap_av1.images.track_images import MIN_IMAGES
-from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
+from colmap_av1.matching.cameras import ImageCameras, new_cameras
 from colmap_av1.matching.few_matches import matching_warning
 from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.image_matches import PairedImages
@@ -607,13 +607,12 @@ def _match_pairs(
 ) -> ImageMatches:
     """Match the images along their tracks, and verify the matches pair by pair."""
     image_set, videos = images.image_set, images.videos
-    shapes = [shape_of(own.video, own.size, own.pixel_aspect) for own in images.shown]
 
     def cameras(paired: PairedImages) -> ImageCameras:
         if listed is not None:
             return listed
         return new_cameras(
-            paired, image_set, shapes, images.inputs.photos, options.camera, context=context
+            paired, image_set, images.shown, images.inputs.photos, options.camera, context=context
         )
 
     return match_images(

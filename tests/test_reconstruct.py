@@ -29,7 +29,7 @@ from trainers import TRAINERS, Taken, brush
 
 from colmap_av1.cli import main
 from colmap_av1.cli.reports import reconstruct_rows
-from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
+from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError, WriteError
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import posed_images, read_model
 from colmap_av1.geometry.posed_model import read_posed_model
@@ -341,7 +341,7 @@ def test_changed_option_redoes_the_stages_that_depend_on_it(
     with monkeypatch.context() as patch:
         writer = importlib.import_module("colmap_av1.splats.reconstruct_model")
         patch.setattr(writer, "write_model", fail_on_full_disk)
-        with pytest.raises(ModelError, match="No space left"):
+        with pytest.raises(WriteError, match="No space left"):
             reconstruct(SCENE, copy, options=strict)
     assert products(copy) == before | others
     assert not list((copy / ".stages").glob("*.partial"))
@@ -448,7 +448,7 @@ def test_failed_long_range_check_adds_loop_closures(
     for name in ("long_range", "first_estimate"):
         (copy / ".stages" / f"{name}.json").unlink()
     found = reconstruct(SCENE, copy, options=options)
-    assert found.links.looked_again == (links == "auto")
+    assert found.links.searched_all == (links == "auto")
     assert (found.links.num_images > 0) == (links == "auto")
     assert found.num_registered == NUM_IMAGES
     assert any("--links sift" in warning for warning in found.warnings) == (links == "none")
@@ -468,7 +468,7 @@ def test_failed_long_range_check_adds_loop_closures_outside_fast_stretches(
     found = reconstruct(SCENE, copy, options=OPTIONS)
     assert found.links.fast == ((0, 9),)  # every third frame is an image, so this is four images
     assert found.links.num_images > 4
-    assert found.links.looked_again
+    assert found.links.searched_all
 
 
 def test_warning_names_images_that_are_not_registered(

@@ -84,19 +84,6 @@ def reprojection_errors(model: PosedModel) -> NDArray[np.float64]:
     return errors
 
 
-def robust_costs(errors: NDArray[np.float64], loss_scale: float) -> NDArray[np.float64]:
-    """Cauchy's loss of reprojection errors, divided by the square of its scale.
-
-    Args:
-        errors: float64 [n] errors in pixels.
-        loss_scale: scale of the loss in pixels.
-
-    Returns:
-        float64 [n].
-    """
-    return np.asarray(np.log1p((errors / loss_scale) ** 2))
-
-
 def write_posed_model(path: Path, model: PosedModel) -> None:
     """Write a model to a file without loss of precision.
 

@@ -16,37 +16,16 @@ from colmap_av1.geometry.cameras import (
     is_nearly_pinhole,
     make_camera,
 )
-from colmap_av1.images.image_set import ImageSet
+from colmap_av1.images.image_set import ImageSet, ShownVideo
 from colmap_av1.images.photos import Photo
 from colmap_av1.matching.focal import estimate_focal_length
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.options import CameraOptions
 from colmap_av1.util.run_context import RunContext
-from colmap_av1.video.facts import Video
 from colmap_av1.video.metadata.lens import container_focal_length
 
 # Focal lengths from tracks and from the container agree if they differ by less than this factor.
 _MAX_FACTOR = 1.2
-
-
-@dataclass(frozen=True)
-class Shape:
-    """Image size and focal length of a video.
-
-    Attributes:
-        size: (width, height) of the images in pixels.
-        pixel_aspect: width of a pixel over its height.
-        focal_length: in pixel heights, from the container; None if the container has none.
-    """
-
-    size: tuple[int, int]
-    pixel_aspect: float
-    focal_length: float | None
-
-
-def shape_of(video: Video, size: tuple[int, int], pixel_aspect: float) -> Shape:
-    """Read the shape of a video's images."""
-    return Shape(size, pixel_aspect, container_focal_length(video.tags, size, pixel_aspect))
 
 
 @dataclass(frozen=True)
@@ -68,7 +47,7 @@ class ImageCameras:
 def new_cameras(
     paired: PairedImages,
     image_set: ImageSet,
-    shapes: Sequence[Shape],
+    shown: Sequence[ShownVideo],
     photos: Sequence[Photo],
     options: CameraOptions,
     *,
@@ -82,7 +61,7 @@ def new_cameras(
     Args:
         paired: the images.
         image_set: maps each image to its video or photo.
-        shapes: the shape of each video.
+        shown: the videos.
         photos: the photos.
         options: camera model, given intrinsics and sharing.
         context: its clock gets the stage "focal length".
@@ -93,20 +72,23 @@ def new_cameras(
     of_images: dict[int, pycolmap.Camera] = {}
     estimated: list[float | None] = []
     notes: dict[str, None] = {}
-    for shared in _sequences_by_camera(len(shapes), photos, options):
+    for shared in _sequences_by_camera(len(shown), photos, options):
         given, aspect = options, 1.0
-        if shared[0] < len(shapes):
-            shape = shapes[shared[0]]
-            size, aspect = shape.size, shape.pixel_aspect
-            of_videos = [i for t in shared if t < len(shapes) for i in image_set.images_of(t)]
+        if shared[0] < len(shown):
+            first = shown[shared[0]]
+            size, aspect = first.size, first.pixel_aspect
+            of_videos = [i for t in shared if t < len(shown) for i in image_set.images_of(t)]
             own = _some_images(paired, of_videos)
             focal_length = shared_focal_length(own, size, aspect, options, context)
             estimated.append(focal_length)
             if given.camera_params is None:
-                focal_length, words = _initial_focal_length(focal_length, shape, given.camera_model)
+                stated = container_focal_length(first.video.tags, size, aspect)
+                focal_length, words = _initial_focal_length(
+                    focal_length, stated, given.camera_model
+                )
                 notes |= dict.fromkeys(words)
         else:
-            photo = photos[shared[0] - len(shapes)]
+            photo = photos[shared[0] - len(shown)]
             size, focal_length = photo.size, photo.focal_length
             given = replace(given, camera_params=None)
         camera = make_camera(given, *size, aspect, focal_length)
@@ -170,14 +152,13 @@ def _some_images(paired: PairedImages, images: Sequence[int]) -> PairedImages:
 
 
 def _initial_focal_length(
-    estimated: float | None, shape: Shape, model: str | None
+    estimated: float | None, stated: float | None, model: str | None
 ) -> tuple[float | None, list[str]]:
     """Choose the initial focal length of a camera; also return warnings about it.
 
     The estimate from tracks is preferred: the container states the focal length of the lens, and
     stabilization may have cropped the pictures since.
     """
-    stated = shape.focal_length
     if stated is None or not is_nearly_pinhole(model):
         return estimated, []
     if estimated is None:

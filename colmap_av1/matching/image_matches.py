@@ -139,7 +139,7 @@ def join_videos(videos: Sequence[PairedImages], image_set: ImageSet) -> PairedIm
 
 def verify_images(
     paired: PairedImages,
-    cameras: pycolmap.Camera | Sequence[pycolmap.Camera],
+    cameras: Sequence[pycolmap.Camera],
     options: VerifyOptions,
     context: RunContext,
 ) -> MatchedImages:
@@ -147,7 +147,7 @@ def verify_images(
 
     Args:
         paired: the images and their matches.
-        cameras: one camera for all images, or one for each.
+        cameras: the camera of each image.
         options: thresholds and effort.
         context: its clock and progress get the stage "verification".
     """
@@ -163,8 +163,7 @@ def verify_images(
             seed=context.seed,
             progress=progress_in(context.progress, "verification", len(pairs)),
         )
-    each = [cameras] * len(keypoints) if isinstance(cameras, pycolmap.Camera) else cameras
-    seconds = [each[second] for second in pairs[:, 1].tolist()]
+    seconds = [cameras[second] for second in pairs[:, 1].tolist()]
     forward_motion = _is_forward_motion(geometries, seconds)
     return MatchedImages(keypoints, pairs, matches, geometries, forward_motion)
 

@@ -18,7 +18,7 @@ from colmap_av1.util.grouping import grouped
 # images even if tracks last for the whole video.
 _UNTHINNED_SPAN = 64
 # Distances in images at which all pairs that share enough tracks are kept.
-NEAR = tuple(range(1, 11))
+_NEAR = tuple(range(1, 11))
 # Largest mean number of pairs per image, unless the pairs at near distances alone are more.
 _MOST_PAIRS = 30
 
@@ -92,7 +92,7 @@ def covisible_pairs(
     keypoints: Sequence[ImageKeypoints],
     min_matches: int,
     *,
-    near: Sequence[int] = NEAR,
+    near: Sequence[int] = _NEAR,
     most_pairs: int = _MOST_PAIRS,
 ) -> NDArray[np.int32]:
     """Choose image pairs that share tracks, at any distance, including revisited places.

@@ -267,8 +267,7 @@ def poselib_camera(focal_length: float) -> dict[str, Any]:
 
 def _essential(pose: Any, focal_a: float, focal_b: float) -> _Floats:
     """The essential matrix of a pose, on undistorted pixels relative to the principal points."""
-    R, t = np.asarray(pose.R), np.asarray(pose.t).reshape(3)
-    E = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]]) @ R
+    E = essential_of_poses(np.eye(3, 4), np.asarray(pose.Rt))
     return np.asarray(E / np.outer([focal_b, focal_b, 1.0], [focal_a, focal_a, 1.0]))
 
 

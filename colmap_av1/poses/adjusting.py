@@ -23,7 +23,7 @@ from colmap_av1.geometry.colmap_model import (
     take_points,
     write_model,
 )
-from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors, robust_costs
+from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.options import ReconstructOptions
 from colmap_av1.options.camera import DEFAULT_MODEL
 from colmap_av1.poses.mapper import ADJUSTMENT_STEPS, ADJUSTMENT_TOLERANCE, adjust_model
@@ -211,8 +211,8 @@ def with_second_distortion(run: Run, model: PosedModel) -> PosedModel:
 
 
 def mean_cost(errors: NDArray[np.float64]) -> float:
-    """Mean Cauchy loss of errors in pixels, with the scale of the last adjustment."""
-    return float(robust_costs(errors, LOSS_SCALES[-1]).mean())
+    """Mean Cauchy loss of errors in pixels, divided by the square of its scale."""
+    return float(np.log1p((errors / LOSS_SCALES[-1]) ** 2).mean())
 
 
 def focal_length_errors(model: PosedModel) -> dict[int, float]:

@@ -132,7 +132,7 @@ def adjustment_stage(
             few = spread.every_nth(_NTH_WITH_CORNERS).split_to_length(_LENGTH_WITH_CORNERS)
             sets = [(few, _WITH_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
         with run.clock.measure("adjustment"):
-            points = [_black_points(run, placed, *own) for own in sets]
+            points = [_triangulated_points(run, placed, *own) for own in sets]
             check_agreement(sum(len(own.xyz) for own in points), spread.num_tracks)
             run.progress("adjustment", 0, 1)
             model = PosedModel(placed.cameras, placed.images, joined_points(points))
@@ -175,10 +175,10 @@ def adjustment_stage(
     )
 
 
-def _black_points(
+def _triangulated_points(
     run: Run, placed: PosedImages, tracks: Tracks, options: TriangulateOptions
 ) -> ModelPoints:
-    """Triangulated points of tracks in the registered images, all black."""
+    """Triangulated points of tracks in the registered images, without colours."""
     seen, view = seen_in(tracks, placed.frames)
     points = triangulate_in(run, placed, seen, view, options=options)
     return to_model_points(points, view, seen.xy[points.observation].astype(np.float64))

@@ -97,7 +97,7 @@ def _adjusted_cameras(
         found = defaultdict[int, _CameraOfImage](dict)
         by_name = model.by_name
         for camera in model.cameras.values():
-            camera.has_prior_focal_length = True  # models do not store it
+            camera.has_prior_focal_length = True  # COLMAP's model files do not hold it
         for i, name in enumerate(names):
             if name in in_model:
                 found[id(initial[i])][i] = model.cameras[by_name[name].camera_id]

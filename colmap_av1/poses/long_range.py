@@ -29,7 +29,7 @@ _Floats = NDArray[np.float64]
 _Image = NDArray[np.uint8]
 
 # Smallest distance in images of a long-range pair. Neighbours agree even in a bent model.
-GAP = 10
+_GAP = 10
 # Two images overlap if this share of the points of one projects into the other, with at most this
 # angle in degrees between the viewing directions and this ratio of the distances (medians).
 _MIN_OVERLAP = 0.5
@@ -99,10 +99,15 @@ class LongRangeErrors:
             linked: whether loop closures have been searched.
         """
         if self.num_in_vain >= _MIN_IN_VAIN:
+            cause = "the poses are wrong"
+            if self.num_features < _SHARP_FEATURES:
+                cause = (
+                    f"the images are blurred or lack texture, with {self.num_features} features "
+                    f"each, or {cause}"
+                )
             return (
                 f"{self.num_in_vain} pairs of images far apart in time overlap by their poses but "
-                f"show nothing in common, with {self.num_features} features per image where sharp "
-                "ones have hundreds: the images are blurred or lack texture, or the poses are wrong"
+                f"show nothing in common: {cause}"
             )
         if not self.contradicts_poses or self.worst is None:
             return None
@@ -247,7 +252,7 @@ def _far_pairs(
         and float64 [n] the viewing angle of each, see `_viewing_angle`.
     """
     num_images = len(images)
-    if num_images <= GAP:
+    if num_images <= _GAP:
         return np.empty((0, 2), np.int32), np.empty(0)
     chosen = evenly_spread(num_images, _NUM_IMAGES)
     views = {i: PosedCamera(cameras[i], images[i].cam_from_world) for i in chosen}
@@ -256,7 +261,7 @@ def _far_pairs(
         points = points_of(i)
         points = points[:: max(1, len(points) // _NUM_POINTS)]
         for j in reversed(chosen):
-            angle = _viewing_angle(points, views[i], views[j]) if j >= i + GAP else None
+            angle = _viewing_angle(points, views[i], views[j]) if j >= i + _GAP else None
             if angle is not None:
                 found.append((i, j, angle))
                 break

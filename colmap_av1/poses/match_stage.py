@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matches
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.matching.cameras import ImageCameras, new_cameras, shape_of
+from colmap_av1.matching.cameras import ImageCameras, new_cameras
 from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.links.report import LinkReport
@@ -218,12 +218,11 @@ def _match_images(
     def cameras(paired: PairedImages) -> ImageCameras:
         if run.cameras is not None:
             return replace(run.cameras, of_images=[run.cameras.of_images[i] for i in index])
-        shapes = [shape_of(own.video, own.size, own.pixel_aspect) for own in run.shown]
-        photos = run.inputs.photos
+        shown, photos = run.shown, run.inputs.photos
         if camera.camera_params is not None or len(index) == len(image_set.sequence):
-            return new_cameras(paired, keyed, shapes, photos, camera, context=context)
+            return new_cameras(paired, keyed, shown, photos, camera, context=context)
         every = pair_videos(image_set, _selected_tracks(run, videos, image_set), groups, context)
-        made = new_cameras(every, image_set, shapes, photos, camera, context=context)
+        made = new_cameras(every, image_set, shown, photos, camera, context=context)
         return replace(made, of_images=[made.of_images[i] for i in index])
 
     return match_images(

@@ -172,9 +172,10 @@ def _map_tracks(
 ) -> PosedModel | None:
     """Map the images of a model from its tracks with COLMAP's global mapper; None if it fails."""
     options = run.options
-    # Models do not store that focal lengths are known, so pairs are verified with fundamental
-    # matrices. With essential matrices, most rendered walks came out slightly more accurate, but
-    # the walk `cafe` bent, with each of four seeds: 10 % of its extent instead of 0.9 %.
+    # COLMAP's model files do not hold that focal lengths are known, so pairs are verified with
+    # fundamental matrices. With essential matrices, most rendered walks came out slightly more
+    # accurate, but the walk `cafe` bent, with each of four seeds: 10 % of its extent instead of
+    # 0.9 %.
     cameras = [known.cameras[image.camera_id] for image in known.images]
     frames = posed_images_of(known, image_set).frames
     min_matches = options.match.pairs.min_matches

@@ -251,7 +251,7 @@ def _points_of_loose_stretches(
     views: NDArray[np.int64],
     point: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """The points at each seam, or those that join a stretch beside it to the model if fewer.
+    """The number of points at each seam; at a weak one, at most those of the stretch beside it.
 
     Where images between two parts of a video are not registered, views on either side of them count
     as near. Both parts may be held together by such points, but not the images between the parts
@@ -271,7 +271,7 @@ def _points_of_loose_stretches(
     if not is_seam.any():
         return crossing
     least = _share_of_median(crossing[is_seam], _FEW, _ENOUGH)
-    # A stretch lies between two seams with few near points, and in one video.
+    # A stretch is a run of images of one video between two seams with few near points.
     ends = ~is_seam | (soon < least)
     stretch = np.append(0, np.cumsum(ends))
     num_stretches = int(stretch[-1]) + 1

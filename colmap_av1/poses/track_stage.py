@@ -154,11 +154,16 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
         return TracksResult(tracks.num_frames, tracks.num_tracks, read_out, tracked.warnings)
 
     mapping = run.options.mapping
-    choice = (run.options.max_images, mapping.pose_tracks_per_image, mapping.pose_spacing)
+    # The images of a long video are chosen by the tracks that poses are estimated from, and include
+    # those that links need.
+    choice = (
+        run.options.max_images,
+        mapping.pose_tracks_per_image,
+        mapping.pose_spacing,
+        options.links,
+    )
     shutter = shutter_settings(options.camera)
-    given = (options.images, choice, options.read, options.tracks, chaining, options.refine)
-    # The images of a long video include those that links need.
-    for_images = options.links if is_long else None
+    given = (options.images, options.read, options.tracks, chaining, options.refine)
     listed = digest_if_there(options.images.frame_list)
     masked = run.inputs.masks.digest if run.inputs.masks is not None else None
     return run_stage(
@@ -167,7 +172,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
         [
             [file_digest(file.path) for file in source.files],
             given,
-            for_images,
+            choice if is_long else None,
             shutter,
             options.run.seed,
             listed,

@@ -425,8 +425,7 @@ def _time(own: VideoTimeline, frame: int) -> str:
 
 
 def _gap_in_words(gap: Gap) -> str:
-    words = f"gap between {gap.before} and {gap.after}: {', '.join(gap.reasons)}"
-    return words if gap.share >= 1 else f"{words}, {gap.share:.0%} of the usual matches"
+    return f"gap between {gap.before} and {gap.after}: {', '.join(gap.reasons)}"
 
 
 def _commands(model: Path, report: ReconstructReport | None) -> list[tuple[str, str]]:

@@ -87,8 +87,8 @@ def test_forward_motion_is_detected(intrinsics: CameraOptions) -> None:
     aside, ahead = paired(make_scene(num_frames=8).tracks), paired(approach())
 
     def is_forward(images: PairedImages) -> bool:
-        camera = make_camera(intrinsics, WIDTH, HEIGHT)
-        return verify_images(images, camera, VerifyOptions(), CONTEXT).forward_motion
+        cameras = [make_camera(intrinsics, WIDTH, HEIGHT)] * len(images.keypoints)
+        return verify_images(images, cameras, VerifyOptions(), CONTEXT).forward_motion
 
     assert is_forward(ahead)
     assert not is_forward(aside)

@@ -9,7 +9,7 @@ from conftest import Ffmpeg
 
 from colmap_av1 import CameraOptions, MatchOptions, match
 from colmap_av1.database.reading import read_cameras
-from colmap_av1.matching.cameras import Shape, _initial_focal_length
+from colmap_av1.matching.cameras import _initial_focal_length
 from colmap_av1.video.metadata.lens import container_focal_length, implausible_focal_length
 
 TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
@@ -43,16 +43,15 @@ def test_implausible_focal_length_is_reported(
 
 
 def test_estimate_from_tracks_overrides_the_container() -> None:
-    shape = Shape((1920, 1080), 1.0, 1300.0)
-    assert _initial_focal_length(1400.0, shape, None) == (1400.0, [])
-    used, (warning,) = _initial_focal_length(1800.0, shape, None)
+    assert _initial_focal_length(1400.0, 1300.0, None) == (1400.0, [])
+    used, (warning,) = _initial_focal_length(1800.0, 1300.0, None)
     assert used == 1800.0
     assert "1300 px" in warning
-    used, (warning,) = _initial_focal_length(None, shape, "RADIAL")
+    used, (warning,) = _initial_focal_length(None, 1300.0, "RADIAL")
     assert used == 1300.0
     assert "1300 px" in warning
-    assert _initial_focal_length(None, shape, "OPENCV_FISHEYE") == (None, [])
-    assert _initial_focal_length(None, Shape((1920, 1080), 1.0, None), None) == (None, [])
+    assert _initial_focal_length(None, 1300.0, "OPENCV_FISHEYE") == (None, [])
+    assert _initial_focal_length(None, None, None) == (None, [])
 
 
 def test_container_focal_length_is_used_if_motion_gives_none(

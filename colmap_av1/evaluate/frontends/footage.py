@@ -158,4 +158,5 @@ def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOpti
         )
     except VideoError:  # No two images share tracks, but other front-ends may still match them.
         return False
-    return verify_images(paired, camera, options.verify, context).forward_motion
+    cameras = [camera] * len(paired.keypoints)
+    return verify_images(paired, cameras, options.verify, context).forward_motion

@@ -13,7 +13,7 @@ from colmap_av1.util.spread import evenly_spread
 
 # Number of images, evenly spread, that each image is compared with.
 _NUM_COMPARED = 8
-# A feature is fixed if it moves by no more than this many pixels between pictures.
+# A feature is fixed if it stays in a cell of this width in pixels or moves to the next one.
 _STILL = 1.0
 # A feature belongs to an overlay if it is fixed in at least this share of the other images.
 _LEAST_SHARE = 0.3

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.matching.features.sift import Features
+from colmap_av1.matching.features.sift import NUM_DIMENSIONS, Features
 
 _NUM_WORDS = 64
 # Number of descriptors on which the vocabulary is trained.
@@ -48,12 +48,18 @@ def similar_images(
 
 def _aggregate(features: Sequence[Features], seed: int) -> NDArray[np.float32]:
     """One unit vector for each image, [n, words * 128]; zeros if an image has no features."""
-    descriptors = np.concatenate([f.descriptors for f in features])
     from scipy.cluster.vq import kmeans2  # noqa: PLC0415 - slow to import
 
-    vectors = np.zeros((len(features), _NUM_WORDS, descriptors.shape[1]), dtype=np.float32)
+    vectors = np.zeros((len(features), _NUM_WORDS, NUM_DIMENSIONS), dtype=np.float32)
     rng = np.random.default_rng(seed)
-    training = descriptors[rng.permutation(len(descriptors))[:_NUM_TRAINING]]
+    # Descriptors are chosen by their number through all images, whose concatenation would be large.
+    first = np.cumsum([0, *(len(f.descriptors) for f in features)])
+    chosen = rng.permutation(first[-1])[:_NUM_TRAINING]
+    owner = np.searchsorted(first, chosen, side="right") - 1
+    training = np.empty((len(chosen), NUM_DIMENSIONS), np.float32)
+    for number, own in enumerate(features):
+        is_own = owner == number
+        training[is_own] = own.descriptors[chosen[is_own] - first[number]]
     if len(training) < _NUM_WORDS:
         return vectors.reshape(len(features), -1)
     words, _ = kmeans2(training, _NUM_WORDS, iter=_NUM_ITERATIONS, minit="points", seed=seed)

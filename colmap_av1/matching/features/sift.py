@@ -21,7 +21,7 @@ _CONTRAST = {"light": 0.04, "full": 0.02}
 # angle of the second nearest.
 _MAX_ANGLE = 0.7
 _MAX_RATIO = 0.8
-_NUM_DIMENSIONS = 128
+NUM_DIMENSIONS = 128
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def extract_features(
     Args:
         picture: uint8 [height, width, 3], BGR.
         max_num_features: largest number of features; those of the highest contrast are kept.
-        effort: "light" finds fewer features in a third of the time, "full" finds all.
+        effort: "light" finds fewer features in half the time, "full" finds all.
     """
     grey = smaller_grey(picture)
     size = tuple(max(1, round(length * _SCALE[effort])) for length in grey.shape[::-1])
@@ -68,7 +68,7 @@ def extract_features(
     xy = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32).reshape(-1, 2) + np.float32(0.5)
     xy *= np.array(picture.shape[1::-1], dtype=np.float32) / grey.shape[::-1]
     if found is None:
-        found = np.empty((0, _NUM_DIMENSIONS), np.float32)
+        found = np.empty((0, NUM_DIMENSIONS), np.float32)
     # RootSIFT (L1 norm, then square root), COLMAP's default.
     sums = np.maximum(found.sum(axis=1, keepdims=True), 1e-6)
     return Features(xy, np.sqrt(found / sums).astype(np.float32))

@@ -92,11 +92,12 @@ def link_images(
     links: LinkOptions,
     context: RunContext,
     name: str,
-    images_apart: float = 1.0,
+    images_apart: float,
 ) -> LinkedImages:
     """Link images by SIFT features where motion does not connect them.
 
-    If motion connects all images, which is possible for a single video only, no picture is decoded.
+    No picture is decoded if motion connects all images of a single video, is trusted everywhere,
+    and reaches over a large part of it.
 
     Args:
         image_set: the images of videos and photos.
@@ -179,7 +180,7 @@ def link_images(
     report = replace(
         linked.report,
         num_images=len(examined),
-        looked_again=searches_all(plan, image_set, matched, images_apart),
+        searched_all=searches_all(plan, image_set, matched, images_apart),
     )
     return replace(linked, report=report)
 
@@ -231,8 +232,6 @@ def _link(
     ]
     merged = merge_links(matched, links, features, [*contradicted, *linked])
     report = LinkReport(
-        num_images=len(plan.wanted),
-        num_tried=len(tried | neighbours),
         num_links=len(links.pairs),
         num_revisits=len(loops & found),
         num_between=len(between & found),

@@ -34,8 +34,8 @@ _LEAST_IMAGES = 120
 # of several videos.
 _LEAST_STEP = 3
 _LEAST_LOOP_IMAGES = 12
-# Number of images of each video, and of photos, in which all SIFT features are extracted. That
-# takes five times as long as light features.
+# Largest number of images of each video, and of photos, that are compared with those of other
+# videos if all SIFT features are extracted, which takes twice as long as light ones.
 _MAX_FULL_IMAGES = 12
 
 
@@ -175,7 +175,10 @@ def _stretches(chosen: NDArray[np.bool_], image_set: ImageSet) -> tuple[range, .
 
 
 def thorough_plan(plan: Plan, image_set: ImageSet) -> Plan:
-    """Extract all SIFT features, in fewer images, because light features gave too few links."""
+    """Extract all SIFT features, and compare fewer images of different videos.
+
+    Light features gave too few links.
+    """
     firsts = [image_set.images_of(video).start for video in range(len(image_set.videos) + 1)]
     between: list[int] = []
     for first, last in pairwise([*firsts, len(image_set.sequence)]):

@@ -18,8 +18,7 @@ class LinkReport:
 
     Attributes:
         num_images: images whose pictures were examined.
-        looked_again: whether loop closures were searched in all videos.
-        num_tried: pairs whose features were matched.
+        searched_all: whether loop closures were searched in all videos.
         num_links: pairs that were linked.
         num_revisits: linked pairs that close a loop.
         num_between: linked pairs of different videos or photos.
@@ -33,8 +32,7 @@ class LinkReport:
     """
 
     num_images: int = 0
-    looked_again: bool = False
-    num_tried: int = 0
+    searched_all: bool = False
     num_links: int = 0
     num_revisits: int = 0
     num_between: int = 0

@@ -127,7 +127,6 @@ def resect_from_corners(run: Run, corners: Tracks, placed: PosedImages) -> Posed
     if len(points.xyz) == 0:
         return placed
     images = list(placed.images)
-    how = run.options.match.run
     cameras = placed.camera_of_image
     sightings = sightings_of(points, seen, seen, placed.frames, cameras)
     focal = np.array([camera.mean_focal_length() for camera in cameras])
@@ -136,8 +135,8 @@ def resect_from_corners(run: Run, corners: Tracks, placed: PosedImages) -> Posed
         np.array([image.cam_from_world for image in images]),
         focal,
         loss_scale=_LOSS_SCALE,
-        seed=how.seed,
-        num_threads=how.num_threads,
+        seed=run.context.seed,
+        num_threads=run.context.num_threads,
     )
     for i, pose in enumerate(found):
         own = slice(int(sightings.bounds[i]), int(sightings.bounds[i + 1]))

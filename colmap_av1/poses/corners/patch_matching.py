@@ -47,7 +47,7 @@ _MAX_RETURN = 0.15
 _MIN_CORRELATION = 0.8
 # Step in pixels over which the deformation of a patch is measured.
 _STEP = 4.0
-# Largest number of points searched in an image, evenly spread. It bounds the time of long videos.
+# Largest number of points searched in an image, evenly spread.
 _MAX_POINTS = 1000
 # An image with fewer matches than this keeps its followed corners, so that it does not lose its
 # connection to the others.
