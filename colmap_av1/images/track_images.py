@@ -124,7 +124,7 @@ def track_chosen_images(
             choice.options,
             existing=choice.existing,
             folder=choice.folder,
-            times=lambda: times_of_frames(source, num_frames),
+            times=lambda: times_of_frames(source, num_frames, options.read),
             decode=lambda wanted: decode_pictures(
                 source, num_frames, options.read, choice.display, wanted=wanted, context=context
             ),

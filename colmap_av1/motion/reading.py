@@ -51,11 +51,14 @@ class _Index:
 
     Attributes:
         shown: for each shown frame, in output order, the event that decoded it.
+        times: the presentation time of each shown frame in seconds; None if the container gives
+            none.
         groups: the groups in bitstream order.
         num_units: number of units of the largest frame.
     """
 
     shown: list[int]
+    times: list[float | None]
     groups: list[_Group]
     num_units: int
 
@@ -133,6 +136,22 @@ def first_showings(video: str | PathLike[str], options: ReadOptions) -> NDArray[
     return first[number].astype(np.int32)
 
 
+def frame_times(
+    video: str | PathLike[str], options: ReadOptions = ReadOptions()
+) -> NDArray[np.float64] | None:
+    """Presentation times of the frames that the headers of a stream show, in output order.
+
+    Returns:
+        float64 [num_shown] seconds, strictly ascending, up to the first damage of the headers; None
+        if the container gives no times or times that do not ascend.
+
+    Raises:
+        LimitError, OptionError, VideoError: as `read_motion`.
+    """
+    times = np.array(_read_index(video, options).times, dtype=np.float64)  # NaN for None
+    return times if np.isfinite(times).all() and (np.diff(times) > 0).all() else None
+
+
 def count_with_repeats(first: NDArray[np.int32], num_shown: int) -> int:
     """Number of shown frames, including repeats of earlier frames at the end.
 
@@ -150,6 +169,7 @@ def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
     A temporal unit with several spatial layers outputs only the highest one (7.18.1).
     """
     shown: list[int] = []
+    times: list[float | None] = []
     groups = [_Group(0, None)]
     num_units = 0
     last_unit = -1
@@ -174,8 +194,10 @@ def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
                     decoded = event.shown_decode_index if event.is_repeated else event.decode_index
                     if event.temporal_unit == last_unit and shown:
                         shown.pop()
+                        times.pop()
                     last_unit = event.temporal_unit
                     shown.append(decoded)
+                    times.append(packet.pts)
     except BitstreamError:
         pass
     sequence = parser.sequence_header()
@@ -184,7 +206,7 @@ def _read_index(video: str | PathLike[str], options: ReadOptions) -> _Index:
         if point > last:
             points = f"points 0 to {last}" if last else "only point 0"
             raise OptionError(f"{video}: has no operating_point {point}: the stream has {points}")
-    return _Index(shown, groups, num_units)
+    return _Index(shown, times, groups, num_units)
 
 
 def _restart_point(parser: _core.Parser) -> _core.RestartPoint | None:
@@ -265,9 +287,9 @@ def _read_events(
     # If the generator is left open, its threads still run when the interpreter exits. It would
     # unwind them, which C++ treats as an unknown exception, so they are ended before.
     atexit.register(end)
-    for thread in readers:
-        thread.start()
     try:
+        for thread in readers:
+            thread.start()
         for group in range(len(index.groups)):
             while True:
                 check_process(video, process)

@@ -20,7 +20,12 @@ from colmap_av1.errors import (
 )
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.info import Structure, read_info
-from colmap_av1.motion.reading import count_with_repeats, first_showings, read_motion
+from colmap_av1.motion.reading import (
+    count_with_repeats,
+    first_showings,
+    frame_times,
+    read_motion,
+)
 from colmap_av1.options import (
     EncodeOptions,
     MatchOptions,
@@ -37,7 +42,7 @@ from colmap_av1.video.coded_size import coded_size, with_downscale
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
 from colmap_av1.video.encode import EncodeReport, encode, stream_of
-from colmap_av1.video.facts import Video, frame_times, read_video
+from colmap_av1.video.facts import Video, read_video
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import FileState
 
@@ -357,9 +362,11 @@ def count_frames(source: VideoSource, options: ReadOptions) -> int:
     return num_shown if presented is None else int((presented < num_shown).sum())
 
 
-def times_of_frames(source: VideoSource, num_frames: int) -> NDArray[np.float64] | None:
+def times_of_frames(
+    source: VideoSource, num_frames: int, options: ReadOptions
+) -> NDArray[np.float64] | None:
     """Times in seconds of the frames that players show: float64 [num_frames]; None if unknown."""
-    times = frame_times(source.stream)
+    times = frame_times(source.stream, options)
     presented = source.pictures.presented
     if times is not None and presented is not None:
         times = times[presented[presented < len(times)]]

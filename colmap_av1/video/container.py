@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import re
 import shlex
@@ -370,6 +371,7 @@ def open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
         container = av.open(
             file or os.path.abspath(path),
             container_options={} if apply_edits else _CONTAINER_OPTIONS,
+            metadata_errors="replace",  # some cameras and programs write Latin-1
         )
     except (PermissionError, av.error.FFmpegError, OSError, ValueError) as error:
         if file is not None:
@@ -428,8 +430,8 @@ def find_video_stream(container: Any, path: Path) -> Any:
     if not moving and container.streams.audio:
         raise VideoError(f"{path}: has audio and a cover picture, no video: give a video")
     moving = moving or streams
-    coded = [s for s in moving if _codec_name(s) == "av1"] or moving
-    return next((s for s in coded if s.frames != 1), coded[0])
+    candidates = [s for s in moving if _codec_name(s) == "av1"] or moving
+    return next((s for s in candidates if s.frames != 1), candidates[0])
 
 
 def find_decodable_stream(container: Any, path: Path) -> Any:
@@ -473,9 +475,11 @@ def _stream_duration(container: Any, stream: Any) -> float | None:
     if tag:
         try:
             hours, minutes, seconds = tag.split(":")
-            return float(hours) * 3600 + float(minutes) * 60 + float(seconds)
+            length = float(hours) * 3600 + float(minutes) * 60 + float(seconds)
         except ValueError:
-            pass
+            length = math.nan
+        if math.isfinite(length):
+            return length
     if container.duration is not None and len(container.streams) == 1:
         return float(Fraction(container.duration, av.time_base))
     return None

@@ -23,22 +23,27 @@ DEINTERLACING = f"{_NAME}={_OPTIONS}"
 def deinterlaced(frames: Generator[Any, None, None]) -> Generator[Any, None, None]:
     """Deinterlace stored frames (av.VideoFrame), keeping the first field of each.
 
+    Frames may change their size.
+
     Raises:
         BitstreamError: as `frames`; the frames before the damage have been yielded.
     """
-    graph = damage = None
+    graph = shape = damage = None
     with closing(frames):
         try:
             for frame in frames:
-                graph = graph or _graph_for(frame)
+                own = frame.width, frame.height, frame.format.name
+                if graph is not None and own != shape:
+                    yield from _flushed(graph)
+                    graph = None
+                if graph is None:
+                    graph, shape = _graph_for(frame), own
                 graph.push(frame)
                 yield from _pulled(graph)
         except BitstreamError as error:
             damage = error
     if graph is not None:
-        # The filter delays frames because it also interpolates from the next one: flush it.
-        graph.push(None)
-        yield from _pulled(graph)
+        yield from _flushed(graph)
     if damage is not None:
         raise damage
 
@@ -53,6 +58,12 @@ def _graph_for(frame: Any) -> Any:
     deinterlacer.link_to(sink)
     graph.configure()
     return graph
+
+
+def _flushed(graph: Any) -> Generator[Any, None, None]:
+    """The frames that the filter delays because it also interpolates from the next one."""
+    graph.push(None)
+    yield from _pulled(graph)
 
 
 def _pulled(graph: Any) -> Generator[Any, None, None]:

@@ -15,6 +15,7 @@ import imageio_ffmpeg
 from colmap_av1.errors import EncodeError
 from colmap_av1.options import EncodeOptions
 from colmap_av1.options.video import NUM_QUALITIES
+from colmap_av1.util.processes import bound
 
 # An encoder works if it can encode this many frames.
 _PROBE_FRAMES = 8
@@ -196,9 +197,7 @@ def _encoders_of(program: str) -> str:
     """The list of encoders that an ffmpeg program prints."""
     command = [program, "-hide_banner", "-encoders"]
     try:
-        run = subprocess.run(
-            command, capture_output=True, text=True, timeout=_PROBE_TIMEOUT, check=False
-        )
+        run = _run(command)
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return run.stdout
@@ -225,14 +224,24 @@ def _probe(program: str, encoder: _Encoder, quality: int, speed: int) -> str | N
     ]
     # fmt: on
     try:
-        run = subprocess.run(
-            command, capture_output=True, text=True, timeout=_PROBE_TIMEOUT, check=False
-        )
+        run = _run(bound(command))  # an encoder of a broken driver may hang
     except subprocess.TimeoutExpired:
         return f"no frame within {_PROBE_TIMEOUT:.0f} s"
     except OSError as error:
         return f"{program}: {error.strerror}"
     return None if run.returncode == 0 else reason_in_log(run.stderr)
+
+
+def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        errors="replace",  # drivers' messages may have another encoding
+        timeout=_PROBE_TIMEOUT,
+        check=False,
+    )
 
 
 def reason_in_log(text: str) -> str:

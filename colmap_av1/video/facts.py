@@ -24,7 +24,6 @@ from colmap_av1.video.container import (
     describe,
     find_decodable_stream,
     open_container,
-    open_stream,
     until_damage,
 )
 from colmap_av1.video.display import Display, shown_size, turn_of_matrix
@@ -163,28 +162,6 @@ def _presented_frames(file: VideoFile, num_entries: int) -> NDArray[np.int32] | 
     return np.flatnonzero([is_shown for _, is_shown in packets]).astype(np.int32)
 
 
-def frame_times(video: str | os.PathLike[str]) -> NDArray[np.float64] | None:
-    """Presentation times of the packets of an AV1 video, each of which shows one frame.
-
-    They are not part of `Video` because few callers need them and the whole file must be read.
-
-    Returns:
-        float64 [num_packets] seconds, strictly ascending; None if the container gives no times
-        or times that do not ascend.
-
-    Raises:
-        VideoError: as `open_stream`.
-    """
-    times: list[float] = []
-    with open_stream(video) as stream, contextlib.suppress(BitstreamError):
-        for packet in stream.packets():
-            if packet.pts is None:
-                return None
-            times.append(packet.pts)
-    found = np.array(times, dtype=np.float64)
-    return found if np.all(np.diff(found) > 0) else None
-
-
 def picture_times(video: Video) -> NDArray[np.float64] | None:
     """Presentation times of all pictures of a video of any codec, also of those hidden by edits.
 
@@ -194,6 +171,8 @@ def picture_times(video: Video) -> NDArray[np.float64] | None:
     Raises:
         VideoError: the file cannot be opened.
     """
+    if not video.is_timed:
+        return None
     times: list[float] = []
     for packet in _packets_before_damage(video):
         if packet.pts is None:

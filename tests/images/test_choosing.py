@@ -25,10 +25,10 @@ from colmap_av1.images.choosing import (
     spread_in_parallax,
 )
 from colmap_av1.match import MatchReport, match
+from colmap_av1.motion.reading import frame_times
 from colmap_av1.options import DensityOptions, ImageOptions, MatchOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.video.decoding import decode_frames
-from colmap_av1.video.facts import frame_times
 
 # All tracks are used, so the observations of an image do not depend on the other images.
 DENSE = MatchOptions(density=DensityOptions(preset="dense"), verify=VerifyOptions(verify="pairs"))

@@ -119,7 +119,7 @@ def test_frames_that_are_not_shown_have_no_tracks(trimmed: Path) -> None:
     found = tracked(source)
     assert found.num_coded_frames == 16
     assert found.tracks.num_frames == 11
-    times = times_of_frames(source, 11)
+    times = times_of_frames(source, 11, ReadOptions())
     assert times is not None
     np.testing.assert_allclose(np.diff(times), 1 / 25)
 
@@ -141,14 +141,14 @@ def test_frame_times_are_given_for_all_frames_or_none(
     clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
 ) -> None:
     source = opened(clip)
-    times = times_of_frames(source, 7)
+    times = times_of_frames(source, 7, ReadOptions())
     assert times is not None
     np.testing.assert_allclose(times, np.arange(7) / 25)
-    assert times_of_frames(source, 17) is None
+    assert times_of_frames(source, 17, ReadOptions()) is None
     timeless = ffmpeg("-i", clip, "-c", "copy", tmp_path / "timeless.ivf")
     data = timeless.read_bytes()
     timeless.write_bytes(data[:16] + bytes(8) + data[24:])  # neither rate nor scale
-    assert times_of_frames(opened(timeless), 16) is None
+    assert times_of_frames(opened(timeless), 16, ReadOptions()) is None
 
 
 def test_poor_stream_is_reported_if_it_could_be_reencoded(

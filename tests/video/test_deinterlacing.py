@@ -92,6 +92,20 @@ def test_pictures_before_damage_are_deinterlaced(camcorder: Path) -> None:
         next(frames)
 
 
+def test_pictures_of_another_size_are_deinterlaced(
+    camcorder: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    words = ("-c:v", "libx264", "-flags", "+ilme+ildct", "-x264opts", "tff=1")
+    large = ffmpeg("-i", camcorder, "-vf", "scale=384:256", *words, tmp_path / "large.ts")
+
+    def frames() -> Generator[Any, None, None]:
+        yield from decode(camcorder, 0, 1)
+        yield from decode(large, 0, 1)
+
+    widths = [frame.width for frame in deinterlaced(frames())]
+    assert widths == [192] * COUNT + [384] * COUNT
+
+
 def test_progressive_video_is_unchanged(
     moments: NDArray[np.uint8], encode: Encode, tmp_path: Path
 ) -> None:

@@ -1,18 +1,21 @@
 from __future__ import annotations
 
 import os
+import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import Ffmpeg
-from ivf_files import packets
+from ivf_files import frame_headers, ivf_of, packets
 
-from colmap_av1 import match
+from colmap_av1 import _core, match
 from colmap_av1.errors import BitstreamError, OptionError, VideoError
 from colmap_av1.motion.info import read_info
+from colmap_av1.motion.reading import frame_times
 from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions
 from colmap_av1.video.container import read_file
-from colmap_av1.video.facts import frame_times, read_video, with_counted_packets
+from colmap_av1.video.facts import picture_times, read_video, with_counted_packets
 from colmap_av1.video.unchanged import check_unchanged
 
 
@@ -68,7 +71,7 @@ def test_invalid_time_scale_is_reported(clip: Path, tmp_path: Path, scale: int) 
     with pytest.warns(UserWarning, match="time scale"):
         info = read_info(path)
     assert (info.num_shown, info.num_cut, info.frame_rate) == (16, 0, None)
-    assert frame_times(read_video(path)) is None
+    assert frame_times(path) is picture_times(read_video(path)) is None
     true, lies = match(tmp_path / "a.db", clip), match(tmp_path / "b.db", path)
     assert (lies.num_frames, lies.num_matches) == (true.num_frames, true.num_matches)
     assert [w for w in lies.warnings if w not in true.warnings] == [read_video(path).doubtful_times]
@@ -125,6 +128,45 @@ def test_change_after_opening_is_detected(clip: Path, tmp_path: Path) -> None:
     os.utime(path, ns=(0, 0))
     with pytest.raises(VideoError, match="changed"):
         check_unchanged(video.state, read_video(path).state)
+
+
+def test_frames_have_the_times_of_the_packets_that_show_them(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """Hidden frames may be packets of their own."""
+    words = ("-c:v", "libaom-av1", "-cpu-used", "8", "-lag-in-frames", "19", "-g", "99")
+    data = ivf_of(ffmpeg("-i", clip, *words, tmp_path / "hidden.mp4"))
+    units, shown = list[bytes](), list[int]()
+    parser = _core.Parser(headers_only=True)
+    for at, _ in frame_headers(data):
+        unit = data[at + 12 : at + 12 + int.from_bytes(data[at : at + 4], "little")]
+        start = end = 0
+        while end < len(unit):
+            event, end = parser.parse(unit, end)
+            if event is not None:
+                shown += [len(units)] if event.is_shown else []
+                units.append(unit[start:end])
+                start = end
+        assert start == end
+    assert len(units) > len(shown) == 16
+    body = b"".join(struct.pack("<IQ", len(u), 2 * i) + u for i, u in enumerate(units))
+    path = tmp_path / "split.ivf"
+    path.write_bytes(data[:32] + body)
+    times = frame_times(path)
+    assert times is not None
+    np.testing.assert_allclose(times, 2 / 25 * np.array(shown))
+
+
+@pytest.mark.parametrize("length", [b"nan:00:00.", b"inf:00:00."])
+def test_length_that_is_not_a_number_is_ignored(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path, length: bytes
+) -> None:
+    path = ffmpeg("-i", clip, "-c", "copy", tmp_path / "lies.mkv")
+    data = path.read_bytes()
+    assert b"00:00:00." in data
+    path.write_bytes(data.replace(b"00:00:00.", length))
+    assert read_file(path).likely_num_packets in (None, 16)
+    assert read_info(path).num_shown == 16
 
 
 @pytest.mark.parametrize("ending", ["mp4", "mkv", "ivf", "obu"])

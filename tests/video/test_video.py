@@ -336,6 +336,18 @@ def test_error_for_other_codecs_gives_the_conversion_command(
     assert len(list(packets(tmp_path / "it's one_av1.mp4"))) == 3
 
 
+def test_metadata_that_is_not_utf8_does_not_matter(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """Some cameras write Latin-1."""
+    words = ("-metadata", "title=Familie", "-metadata:s:v", "title=Familie")
+    named = ffmpeg("-i", clip, "-c", "copy", *words, tmp_path / "named.mkv")
+    data = named.read_bytes()
+    assert b"Familie" in data
+    named.write_bytes(data.replace(b"Familie", b"Fam\xeflie"))
+    assert len(list(packets(named))) == len(list(packets(clip)))
+
+
 def test_audio_file_is_refused(ffmpeg: Ffmpeg, tmp_path: Path) -> None:
     tone = ffmpeg("-f", "lavfi", "-i", "sine=duration=0.2", tmp_path / "tone.mp4")
     with pytest.raises(VideoError, match="audio"):
