@@ -5,9 +5,7 @@ chapters (03.symbols.md to 10.additional.tables.md). The files constants.h, spec
 default_cdfs.h and default_cdfs.cc are written next to this script; they are committed, so building
 the package needs neither the specification nor this script.
 
-Every array definition of the chapters is either emitted or named in ``_PIXEL_TABLES`` or
-``_NOT_CONSTANT``: a table that a later edition of the specification adds is never dropped
-unnoticed.
+Only the tables and constants that the core's sources name are written.
 """
 
 from __future__ import annotations
@@ -33,48 +31,9 @@ _TABLE_CHAPTERS = (
     "10.additional.tables.md",
 )
 
-# Tables that only the reconstruction of samples reads.
-_PIXEL_TABLES = frozenset(
-    (
-        "Ac_Qlookup",
-        "Cdef_Directions",
-        "Cdef_Pri_Taps",
-        "Cdef_Sec_Taps",
-        "Cdef_Uv_Dir",
-        "Cos128_Lookup",
-        "Dc_Qlookup",
-        "Div_Table",
-        "Dr_Intra_Derivative",
-        "Gaussian_Sequence",
-        "Ii_Weights_1d",
-        "Intra_Edge_Kernel",
-        "Intra_Filter_Taps",
-        "Mode_To_Angle",
-        "Obmc_Mask_16",
-        "Obmc_Mask_2",
-        "Obmc_Mask_32",
-        "Obmc_Mask_4",
-        "Obmc_Mask_8",
-        "Qm_Offset",
-        "Quantizer_Matrix",
-        "Sm_Weights_Tx_16x16",
-        "Sm_Weights_Tx_32x32",
-        "Sm_Weights_Tx_4x4",
-        "Sm_Weights_Tx_64x64",
-        "Sm_Weights_Tx_8x8",
-        "Subpel_Filters",
-        "Transform_Row_Shift",
-        "Upscale_Filter",
-        "Warped_Filters",
-        "Wedge_Codebook",
-        "Wedge_Master_Oblique_Even",
-        "Wedge_Master_Oblique_Odd",
-        "Wedge_Master_Vertical",
-    )
-)
-
-# Written as an array, but its entries are variables of the temporal scan process (7.10.2.5).
-_NOT_CONSTANT = frozenset(("tplSamplePos",))
+# The sources of the core, except the generated ones.
+_CORE = Path(__file__).parents[1]
+_GENERATED = ("constants.h", "default_cdfs.h", "default_cdfs.cc", "spec_tables.h")
 
 _INT_TYPES = (
     ("std::uint8_t", 0, 2**8 - 1),
@@ -100,6 +59,12 @@ _COMMENT = re.compile(r" *//.*|/\*.*?\*/")
 _TOKEN = re.compile(r"\s*([{},]|[^{},\s][^{},]*)")
 
 
+def _cpp_name(name: str) -> str:
+    """Name of a table in C++: ``k`` and the specification's name without its underscores."""
+    plain = name.replace("_", "")
+    return f"k{plain[0].upper()}{plain[1:]}"
+
+
 @dataclass(frozen=True)
 class _Table:
     """One array of the specification: its name there, its dimensions and its resolved values."""
@@ -110,9 +75,7 @@ class _Table:
 
     @property
     def cpp_name(self) -> str:
-        """Name in C++: ``k`` and the specification's name without its underscores."""
-        plain = self.name.replace("_", "")
-        return f"k{plain[0].upper()}{plain[1:]}"
+        return _cpp_name(self.name)
 
     @property
     def is_cdf(self) -> bool:
@@ -269,13 +232,22 @@ def _check_cdf(table: _Table) -> None:
             raise ValueError(f"{table.name}: the row {row} is not a CDF; check the specification")
 
 
-def _read_tables(text: str, constants: dict[str, int]) -> list[_Table]:
-    """All array definitions of the text, checked against the dimensions that they state."""
+def _used_names() -> set[str]:
+    """All words of the core's sources."""
+    files = [f for f in _CORE.rglob("*") if f.suffix in (".cc", ".h") and f.name not in _GENERATED]
+    return set(re.findall(r"\w+", "\n".join(f.read_text(encoding="utf-8") for f in files)))
+
+
+def _read_tables(text: str, constants: dict[str, int], used: set[str]) -> list[_Table]:
+    """The array definitions of the text with these names in C++.
+
+    They are checked against the dimensions that they state.
+    """
     text = _COMMENT.sub("", text)
     tables: list[_Table] = []
     for match in _DEFINITION.finditer(text):
         name = match[1]
-        if name in _PIXEL_TABLES or name in _NOT_CONSTANT:
+        if _cpp_name(name) not in used:
             continue
         try:
             dims = tuple(_evaluate(dim, constants) for dim in _DIMENSION.findall(match[2]))
@@ -356,9 +328,13 @@ def _constexpr_header(tables: list[_Table]) -> str:
     )
 
 
-def _constants_header(symbols: dict[str, int], enumerations: dict[str, int]) -> str:
+def _constants_header(
+    symbols: dict[str, int], enumerations: dict[str, int], used: set[str]
+) -> str:
     def lines(constants: dict[str, int]) -> str:
-        return "\n".join(f"inline constexpr int {n} = {v};" for n, v in constants.items())
+        return "\n".join(
+            f"inline constexpr int {n} = {v};" for n, v in constants.items() if n in used
+        )
 
     new = {name: value for name, value in enumerations.items() if name not in symbols}
     return (
@@ -395,11 +371,12 @@ def generate(spec_dir: Path) -> dict[str, str]:
     for name, value in enumerations.items():
         _add(constants, name, value)
     text = "\n".join((spec_dir / name).read_text(encoding="utf-8") for name in _TABLE_CHAPTERS)
-    tables = _read_tables(text, constants)
+    used = _used_names()
+    tables = _read_tables(text, constants, used)
     cdfs = [table for table in tables if table.is_cdf]
     others = [table for table in tables if not table.is_cdf]
     return {
-        "constants.h": _constants_header(symbols, enumerations),
+        "constants.h": _constants_header(symbols, enumerations, used),
         "default_cdfs.h": _header(cdfs),
         "default_cdfs.cc": _source(cdfs, "default_cdfs.h"),
         "spec_tables.h": _constexpr_header(others),

@@ -177,20 +177,6 @@ inline constexpr std::uint16_t kDivLut[257] = {
   8322, 8306, 8289, 8273, 8257, 8240, 8224, 8208, 8192,
 };
 
-inline constexpr std::uint8_t kQuantDistWeight[4][2] = {
-  {2, 3},
-  {2, 5},
-  {2, 7},
-  {1, 31},
-};
-
-inline constexpr std::uint8_t kQuantDistLookup[4][2] = {
-  {9, 7},
-  {11, 5},
-  {12, 4},
-  {13, 3},
-};
-
 inline constexpr std::uint8_t kSgrParams[16][4] = {
   {2, 12, 1, 4},
   {2, 15, 1, 6},
@@ -355,24 +341,6 @@ inline constexpr std::uint8_t kCoeffBaseCtxOffset[19][5][5] = {
 };
 
 inline constexpr std::uint8_t kCoeffBasePosCtxOffset[3] = {26, 31, 36};
-
-inline constexpr std::uint8_t kMagRefOffsetWithTxClass[3][3][2] = {
-  {
-    {0, 1},
-    {1, 0},
-    {1, 1},
-  },
-  {
-    {0, 1},
-    {1, 0},
-    {0, 2},
-  },
-  {
-    {0, 1},
-    {1, 0},
-    {2, 0},
-  },
-};
 
 inline constexpr std::uint8_t kFilterIntraModeToIntraDir[5] = {0, 1, 2, 6, 0};
 
@@ -793,30 +761,6 @@ inline constexpr std::uint8_t kTxHeightLog2[19] = {
 
 inline constexpr std::uint8_t kWedgeBits[22] = {
   0, 0, 0, 4, 4, 4, 4, 4, 4, 4, 0, 0, 0, 0, 0, 0, 0, 0, 4, 4, 0, 0,
-};
-
-inline constexpr std::uint8_t kSigRefDiffOffset[3][5][2] = {
-  {
-    {0, 1},
-    {1, 0},
-    {1, 1},
-    {0, 2},
-    {2, 0},
-  },
-  {
-    {0, 1},
-    {1, 0},
-    {0, 2},
-    {0, 3},
-    {0, 4},
-  },
-  {
-    {0, 1},
-    {1, 0},
-    {2, 0},
-    {3, 0},
-    {4, 0},
-  },
 };
 
 inline constexpr std::uint8_t kAdjustedTxSize[19] = {
