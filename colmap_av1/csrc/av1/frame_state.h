@@ -1,6 +1,7 @@
 // State of a frame: its blocks while it is parsed, and the parts that later frames refer to.
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <bit>
 #include <cstddef>
@@ -71,6 +72,7 @@ struct BlockInfo {
 
   int bw4() const { return kNum4x4BlocksWide[mi_size]; }
   int bh4() const { return kNum4x4BlocksHigh[mi_size]; }
+  bool is_at_least_8x8() const { return std::min(bw4(), bh4()) >= 2; }
   bool is_compound() const { return ref_frame[1] > INTRA_FRAME; }
 };
 

@@ -140,13 +140,13 @@ void FrameHeaderReader::uncompressed_header() {
     h.show_frame = r.flag();
     if (h.show_frame && has_temporal_point) temporal_point_info();
     h.showable_frame = h.show_frame ? h.frame_type != KEY_FRAME : r.flag();
-    if (h.frame_type == SWITCH_FRAME || (h.frame_type == KEY_FRAME && h.show_frame)) {
+    if (h.frame_type == SWITCH_FRAME || h.is_shown_key_frame()) {
       h.error_resilient_mode = true;
     } else {
       h.error_resilient_mode = r.flag();
     }
   }
-  if (h.frame_type == KEY_FRAME && h.show_frame) {
+  if (h.is_shown_key_frame()) {
     for (ReferenceInfo& ref : refs_) {
       ref.valid = false;
       ref.order_hint = 0;
@@ -183,7 +183,7 @@ void FrameHeaderReader::uncompressed_header() {
       }
     }
   }
-  if (h.frame_type == SWITCH_FRAME || (h.frame_type == KEY_FRAME && h.show_frame)) {
+  if (h.frame_type == SWITCH_FRAME || h.is_shown_key_frame()) {
     h.refresh_frame_flags = kAllFrames;
   } else {
     h.refresh_frame_flags = r.literal(8);

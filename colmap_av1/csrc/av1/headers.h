@@ -76,6 +76,9 @@ GmParams default_gm_params();
 // Values of one frame header under the specification's names. Arrays indexed by reference
 // frame use the numbers INTRA_FRAME .. ALTREF_FRAME.
 struct FrameHeader {
+  bool is_shown() const { return show_frame || show_existing_frame; }
+  bool is_shown_key_frame() const { return frame_type == KEY_FRAME && show_frame; }
+
   int temporal_id = 0;
   int spatial_id = 0;
   bool show_existing_frame = false;

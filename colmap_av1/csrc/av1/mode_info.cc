@@ -16,10 +16,6 @@ bool has_nearmv(int y_mode) {
   return y_mode == NEARMV || y_mode == NEAR_NEARMV || y_mode == NEAR_NEWMV || y_mode == NEW_NEARMV;
 }
 
-int min_block_edge(const BlockInfo& b) {
-  return std::min(kBlockWidth[b.mi_size], kBlockHeight[b.mi_size]);
-}
-
 // 5.11.9: maps the coded value back around the predicted segment
 int neg_deinterleave(int diff, int ref, int max) {
   if (!ref) return diff;
@@ -178,7 +174,7 @@ int TileParser::predicted_segment_id() const {
 void TileParser::read_skip_mode() {
   if (!header_->skip_mode_present || seg_feature_active(SEG_LVL_SKIP) ||
       seg_feature_active(SEG_LVL_REF_FRAME) || seg_feature_active(SEG_LVL_GLOBALMV) ||
-      min_block_edge(*b_) < 8) {
+      !b_->is_at_least_8x8()) {
     return;
   }
   const int ctx = (above_ && above_->skip_mode) + (left_ && left_->skip_mode);
@@ -321,7 +317,7 @@ int TileParser::read_drl(const MvStack& stack, int first) {
 }
 
 bool TileParser::needs_interp_filter() const {
-  const bool large = min_block_edge(*b_) >= 8;
+  const bool large = b_->is_at_least_8x8();
   if (b_->skip_mode || b_->motion_mode == LOCALWARP) return false;
   if (large && b_->y_mode == GLOBALMV) {
     return header_->gm_type[b_->ref_frame[0]] == TRANSLATION;
@@ -367,7 +363,7 @@ void TileParser::read_interp_filters() {
 
 // 5.11.27 Read motion mode syntax
 void TileParser::read_motion_mode() {
-  if (b_->skip_mode || !header_->is_motion_mode_switchable || min_block_edge(*b_) < 8) return;
+  if (b_->skip_mode || !header_->is_motion_mode_switchable || !b_->is_at_least_8x8()) return;
   if (!header_->force_integer_mv && (b_->y_mode == GLOBALMV || b_->y_mode == GLOBAL_GLOBALMV) &&
       header_->gm_type[b_->ref_frame[0]] > TRANSLATION) {
     return;

@@ -24,8 +24,7 @@ bool is_position_valid(int position, int v8, int max8, int max_off8) {
 bool project(const SequenceHeader& seq, const FrameHeader& header, const FrameState* source,
              int src, int dst_sign, std::vector<MotionFieldEntry>& motion_field) {
   if (source == nullptr || source->header.mi_rows != header.mi_rows ||
-      source->header.mi_cols != header.mi_cols || source->header.frame_is_intra ||
-      source->saved_motion.empty()) {
+      source->header.mi_cols != header.mi_cols || source->header.frame_is_intra) {
     return false;
   }
   const int h8 = header.mi_rows >> 1;

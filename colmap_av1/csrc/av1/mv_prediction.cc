@@ -241,12 +241,9 @@ void MvStackFinder::temporal_sample(const MotionFieldEntry& entry, bool first) {
 // processes
 void MvStackFinder::add_ref_mv_candidate(const BlockInfo& candidate, int weight) {
   if (!candidate.is_inter) return;
-  const auto is_large = [&] {
-    return std::min(kBlockWidth[candidate.mi_size], kBlockHeight[candidate.mi_size]) >= 8;
-  };
   const auto candidate_mv = [&](int cand_list, int list, bool global) {
     return lower_mv_precision(global && header_.gm_type[block_.ref_frame[list]] > TRANSLATION &&
-                                      is_large()
+                                      candidate.is_at_least_8x8()
                                   ? stack_.global_mvs[list]
                                   : candidate.mv[cand_list]);
   };

@@ -179,7 +179,7 @@ std::size_t Parser::frame_header_obu(Bytes data, int temporal_id, int spatial_id
   // Containers may omit temporal delimiters. A temporal unit has one shown frame for each spatial
   // layer, in ascending order (7.5).
   if (temporal_unit_ < 0 || spatial_id <= shown_spatial_id_) start_temporal_unit();
-  if (header_.show_frame || header_.show_existing_frame) shown_spatial_id_ = spatial_id;
+  if (header_.is_shown()) shown_spatial_id_ = spatial_id;
   event_ = std::make_unique<Event>();
   event_->header = header_;
   event_->decode_index = num_events_;
@@ -233,9 +233,9 @@ void Parser::start_frame() {
     constexpr int kNoScale = 1 << REF_SCALE_SHIFT;
     context_.ref_scaled[ref] = x_scale != kNoScale || y_scale != kNoScale;
     context_.ref_usable[ref] = 2 * header_.frame_width >= reference.upscaled_width &&
-                                2 * header_.frame_height >= reference.frame_height &&
-                                header_.frame_width <= 16 * reference.upscaled_width &&
-                                header_.frame_height <= 16 * reference.frame_height;
+                               2 * header_.frame_height >= reference.frame_height &&
+                               header_.frame_width <= 16 * reference.upscaled_width &&
+                               header_.frame_height <= 16 * reference.frame_height;
     context_.ref_distance[ref] = seq_->relative_dist(header_.order_hint, header_.order_hints[ref]);
     event_->ref_decode_index[ref] = refs[ref]->decode_index;
     event_->ref_size[ref] = {reference.upscaled_width, reference.frame_height};

@@ -30,7 +30,7 @@ struct Event {
   FrameHeader header;
   int decode_index = 0;  // index of this event
   int temporal_unit = 0;
-  int obu_offset = 0;  // of the frame's first OBU in its temporal unit, in bytes
+  int obu_offset = 0;  // of the frame's first OBU in the data passed to `parse`, in bytes
   int num_tile_groups = 0;
   int num_wrong_trailing_bits = 0;  // tiles that do not end as the specification requires
   int shown_decode_index = -1;      // show_existing_frame: the event that decoded the frame

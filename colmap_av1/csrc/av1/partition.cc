@@ -303,8 +303,8 @@ void TileParser::read_lr_unit(int plane) {
   if (restoration_type == RESTORE_WIENER) {
     for (auto& taps : ref_lr_wiener_[plane]) {
       for (int j = plane ? 1 : 0; j < WIENER_COEFFS; ++j) {
-        taps[j] = decode_signed_subexp_with_ref(symbols_, kWienerTapsMin[j],
-                                                kWienerTapsMax[j] + 1, kWienerTapsK[j], taps[j]);
+        taps[j] = decode_signed_subexp_with_ref(symbols_, kWienerTapsMin[j], kWienerTapsMax[j] + 1,
+                                                kWienerTapsK[j], taps[j]);
       }
     }
   } else if (restoration_type == RESTORE_SGRPROJ) {

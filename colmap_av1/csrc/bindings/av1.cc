@@ -45,7 +45,7 @@ nb::dict header_dict(const Event& event) {
   d["spatial_id"] = h.spatial_id;
   d["show_existing_frame"] = static_cast<int>(h.show_existing_frame);
   d["frame_type"] = h.frame_type;
-  d["show_frame"] = static_cast<int>(h.show_frame || h.show_existing_frame);
+  d["show_frame"] = static_cast<int>(h.is_shown());
   d["order_hint"] = h.order_hint;
   d["refresh_frame_flags"] = h.refresh_frame_flags;
   if (h.show_existing_frame) {
@@ -185,14 +185,9 @@ void bind_av1(nb::module_& m) {
       .def_ro("num_wrong_trailing_bits", &Event::num_wrong_trailing_bits)
       .def_prop_ro("num_units", [](const Event& e) { return e.header.mi_rows * e.header.mi_cols; })
       .def_prop_ro("is_repeated", [](const Event& e) { return e.header.show_existing_frame; })
-      .def_prop_ro(
-          "is_shown",
-          [](const Event& e) { return e.header.show_frame || e.header.show_existing_frame; })
+      .def_prop_ro("is_shown", [](const Event& e) { return e.header.is_shown(); })
       .def_prop_ro("is_shown_key_frame",
-                   [](const Event& e) {
-                     return e.header.frame_type == av1::KEY_FRAME && e.header.show_frame &&
-                            !e.header.show_existing_frame;
-                   })
+                   [](const Event& e) { return e.header.is_shown_key_frame(); })
       .def("header", &header_dict)
       .def("take_blocks", &take_blocks)
       .def("tile_sizes", [](const Event& e) { return int32_array(e.tile_sizes); })

@@ -119,8 +119,8 @@ nb::tuple find_patches(const InputArray<std::uint8_t, nb::ndim<3>>& patches, con
 }
 
 geometry::ObservedPoints observed_points(const Poses& cam_from_world, const Pairs& focal,
-                                 const Indices& view, const Pairs& rays, const Points& xyz,
-                                 const Indices& offsets, const Indices& observation) {
+                                         const Indices& view, const Pairs& rays, const Points& xyz,
+                                         const Indices& offsets, const Indices& observation) {
   return {.cam_from_world = span_of(cam_from_world),
           .focal = span_of(focal),
           .view = span_of(view),

@@ -11,9 +11,9 @@
 
 namespace colmap_av1::fuzz {
 
-inline void check(bool promise, const char* what) {
-  if (promise) return;
-  std::fprintf(stderr, "broken promise: %s\n", what);
+inline void check(bool condition, const char* what) {
+  if (condition) return;
+  std::fprintf(stderr, "violated condition: %s\n", what);
   std::abort();
 }
 

@@ -87,12 +87,12 @@ void run_points(Input& input) {
   const Indices observation = indices(input, num_seen, num_seen);
   const Indices rows = offsets(input, num_points, num_seen);
   const geometry::ObservedPoints points{.cam_from_world = poses,
-                                    .focal = focal,
-                                    .view = view,
-                                    .rays = rays,
-                                    .xyz = xyz,
-                                    .offsets = rows,
-                                    .observation = observation};
+                                        .focal = focal,
+                                        .view = view,
+                                        .rays = rays,
+                                        .xyz = xyz,
+                                        .offsets = rows,
+                                        .observation = observation};
   refused_or([&] {
     const Doubles errors = geometry::reprojection_errors(points);
     check(errors.size() == num_seen &&

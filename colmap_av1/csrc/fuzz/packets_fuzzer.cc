@@ -14,12 +14,12 @@
 #include "av1/error.h"
 #include "av1/parser.h"
 #include "fuzz/input.h"
+#include "fuzz/parse.h"
 
 namespace {
 
 using colmap_av1::av1::BitstreamError;
 using colmap_av1::av1::Event;
-using colmap_av1::av1::LimitError;
 using colmap_av1::av1::Parser;
 using colmap_av1::av1::ParserOptions;
 using colmap_av1::av1::RestartPoint;
@@ -39,18 +39,9 @@ struct Group {
 };
 
 // Parses a packet and appends its events; false if the packet is damaged.
-bool parse(Parser& parser, const Packet& packet, Events& events) {
-  try {
-    for (std::size_t position = 0; position < packet.size();) {
-      auto event = parser.parse(packet, position);
-      if (event != nullptr) events.push_back(std::move(event));
-    }
-  } catch (const BitstreamError&) {
-    return false;
-  } catch (const LimitError&) {
-    return false;
-  }
-  return true;
+bool append(Parser& parser, const Packet& packet, Events& events) {
+  return colmap_av1::fuzz::parse(
+      parser, packet, [&](std::unique_ptr<Event> event) { events.push_back(std::move(event)); });
 }
 
 std::vector<Group> groups_of(const std::vector<Packet>& packets, ParserOptions options) {
@@ -64,13 +55,9 @@ std::vector<Group> groups_of(const std::vector<Packet>& packets, ParserOptions o
     } catch (const BitstreamError&) {  // the parser is inside a frame
     }
     Events events;
-    const bool whole = parse(parser, packets[i], events);
-    if (i > 0 && start && !events.empty()) {
-      const auto& header = events.front()->header;
-      if (header.frame_type == colmap_av1::av1::KEY_FRAME && header.show_frame &&
-          !header.show_existing_frame) {
-        groups.push_back({i, start});
-      }
+    const bool whole = append(parser, packets[i], events);
+    if (i > 0 && start && !events.empty() && events.front()->header.is_shown_key_frame()) {
+      groups.push_back({i, start});
     }
     if (!whole) break;
   }
@@ -118,7 +105,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
   bool damaged = false;
   for (std::size_t num_events = 0; num_whole < packets.size() && num_events < kMaxEvents;
        ++num_whole) {
-    if (!parse(parser, packets[num_whole], events[num_whole])) {
+    if (!append(parser, packets[num_whole], events[num_whole])) {
       damaged = true;
       break;
     }
@@ -131,7 +118,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     for (std::size_t i = groups[g].first_packet; i < end && i <= num_whole; ++i) {
       if (i == num_whole && !damaged) break;
       Events found;
-      const bool whole = parse(reader, packets[i], found);
+      const bool whole = append(reader, packets[i], found);
       check(whole == (i < num_whole), "groups end where the stream does");
       check(found.size() == events[i].size(), "groups have the same frames");
       for (std::size_t k = 0; k < found.size(); ++k) check_same(*found[k], *events[i][k]);

@@ -5,20 +5,20 @@
 #include <cstdint>
 #include <memory>
 #include <span>
-#include <vector>
 
 #include "av1/error.h"
 #include "av1/parser.h"
 #include "fuzz/input.h"
+#include "fuzz/parse.h"
 
 namespace {
 
 using colmap_av1::av1::BitstreamError;
 using colmap_av1::av1::Event;
-using colmap_av1::av1::LimitError;
 using colmap_av1::av1::Parser;
 using colmap_av1::av1::ParserOptions;
 using colmap_av1::fuzz::check;
+using colmap_av1::fuzz::parse;
 
 // A few bytes can require a large frame; these limits bound the time of one input.
 constexpr std::int64_t kMaxFrameSize = 512 * 512;
@@ -75,29 +75,19 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
   Parser parser(options);
   std::size_t num_events = 0;
   std::span<const std::uint8_t> first;
-  const auto parse = [&](std::span<const std::uint8_t> unit) {
-    // The parser gets a copy, so that a read past the unit is a read past an allocation.
-    const std::vector<std::uint8_t> copy(unit.begin(), unit.end());
-    try {
-      for (std::size_t position = 0; position < copy.size();) {
-        const auto event = parser.parse(copy, position);
-        if (event == nullptr) continue;
-        ++num_events;
-        check_event(*event, options);
-      }
-    } catch (const BitstreamError&) {  // a caller may continue after an error
-    } catch (const LimitError&) {
-    }
+  const auto take = [&](std::unique_ptr<Event> event) {
+    ++num_events;
+    check_event(*event, options);
   };
   while (!input.empty() && num_events < kMaxEvents) {
     const auto unit = input.unit();
     if (first.empty()) first = unit;
-    parse(unit);
+    parse(parser, unit, take);  // a caller may continue after an error
   }
   try {
     // Any data may follow a restart, as when a reader starts at a later group of frames.
     parser.restart(parser.restart_point());
-    parse(first);
+    parse(parser, first, take);
     parser.finish();
   } catch (const BitstreamError&) {
   }

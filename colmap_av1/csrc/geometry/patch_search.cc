@@ -223,10 +223,10 @@ FoundPatches find_patches(const CutPatches& patches, const GreyPicture& target,
   }
   const auto num_patches = static_cast<std::int64_t>(patches.pixels.size() / size);
   const FloatPicture picture(target, kMargin);
-  FoundPatches found{.xy = {start.begin(), start.end()},
-                     .forward_backward_error =
-                         std::vector<float>(count, std::numeric_limits<float>::infinity()),
-                     .correlation = std::vector<float>(count, -1.0F)};
+  FoundPatches found{
+      .xy = {start.begin(), start.end()},
+      .forward_backward_error = std::vector<float>(count, std::numeric_limits<float>::infinity()),
+      .correlation = std::vector<float>(count, -1.0F)};
   Block<kWindow + 2> around;
   Window<kWindow> sought;
   Window<kWindow> shown;

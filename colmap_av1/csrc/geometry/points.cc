@@ -49,7 +49,7 @@ struct InSquare {
 
 // Counts the floaters among the points of one square, which are reordered.
 void count_floaters(std::span<InSquare> square, const FloaterOptions& options,
-                   std::vector<std::int64_t>& counts) {
+                    std::vector<std::int64_t>& counts) {
   if (static_cast<std::int64_t>(square.size()) < options.fewest_in_square) return;
   const auto middle = square.begin() + static_cast<std::ptrdiff_t>(square.size() / 2);
   std::nth_element(square.begin(), middle, square.end(),

@@ -26,7 +26,7 @@ void append(const std::array<T, size>& from, std::size_t count, std::vector<T>& 
 // this has no branches, because visibility is too random for branch prediction.
 template <typename Write, typename Take>
 void visit_visible(std::span<const double, 12> cam_from_world, std::span<const double> xyz,
-              std::vector<std::int64_t>& seen, const Write& write, const Take& take) {
+                   std::vector<std::int64_t>& seen, const Write& write, const Take& take) {
   const std::size_t total = xyz.size() / 3;
   std::array<std::int64_t, kChunk> index;
   for (std::size_t first = 0; first < total; first += kChunk) {

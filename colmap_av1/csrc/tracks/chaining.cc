@@ -163,7 +163,7 @@ void Chainer::claim_track(const Link& link, int list, Reach reach, Searcher sear
     const int cell = std::exchange(claims_[best.cell], best.claim).cell;
     if (cell < 0) return;
     searcher = {cell, current_->unit_of(grid_, cell),
-             grid_.centre(cell / current_->cell_cols, cell % current_->cell_cols)};
+                grid_.centre(cell / current_->cell_cols, cell % current_->cell_cols)};
   }
 }
 

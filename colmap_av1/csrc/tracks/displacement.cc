@@ -35,8 +35,7 @@ Displacement DisplacementModel::at(int unit, int list) const {
     return result;
   }
   result.ref = ref;
-  const bool large =
-      std::min(av1::kBlockWidth[block.mi_size], av1::kBlockHeight[block.mi_size]) >= 8;
+  const bool large = block.is_at_least_8x8();
   if (large && block.motion_mode == av1::LOCALWARP && block.warp_index >= 0) {
     result.warp = &frame_.local_warp_params[static_cast<std::size_t>(block.warp_index)];
   } else if (large && global_warp_[ref] &&

@@ -16,10 +16,7 @@ bool is_in(std::span<const std::int32_t> slots, const ChainedFrame& frame) {
 }  // namespace
 
 TrackBuilder::TrackBuilder(const TrackBuilderOptions& options)
-    : options_(options),
-      grid_(options.cells),
-      chainer_(options, grid_),
-      store_(options) {
+    : options_(options), grid_(options.cells), chainer_(options, grid_), store_(options) {
   const auto is_part = [](int count) { return count == 1 || count == 2 || count == 4; };
   const int size = options.seeding;
   if (!is_part(options.cells) || !(is_part(size) || size == 2 * options.cells) ||
@@ -29,26 +26,26 @@ TrackBuilder::TrackBuilder(const TrackBuilderOptions& options)
   if (options.tracks_per_sample < 0) throw std::invalid_argument("tracks_per_sample is negative");
 }
 
-void TrackBuilder::add(const FrameMotion& coded) {
-  check_frame_motion(coded);
-  check_order(coded);
-  if (coded.display_index >= 0) {
-    if (!store_.has_size()) store_.set_size(coded.width, coded.height);
-    num_frames_ = std::max(num_frames_, coded.display_index + 1);
+void TrackBuilder::add(const FrameMotion& motion) {
+  check_frame_motion(motion);
+  check_order(motion);
+  if (motion.display_index >= 0) {
+    if (!store_.has_size()) store_.set_size(motion.width, motion.height);
+    num_frames_ = std::max(num_frames_, motion.display_index + 1);
   }
-  ChainedFrame& frame = read_frame(coded);
+  ChainedFrame& frame = read_frame(motion);
   if (!frame.is_shown()) chain_frame(frame);
   // A shown frame that is in no reference slot has been output. Frames are output in display order,
   // so all frames before it have been read.
   for (const auto& other : frames_) {
     const bool is_output =
-        other.get() == &frame ? coded.show_frame : !is_in(coded.slot_decode_index, *other);
+        other.get() == &frame ? motion.show_frame : !is_in(motion.slot_decode_index, *other);
     if (!other->is_chained() && is_output) {
       last_display_ = std::max(last_display_, other->motion.display_index);
     }
   }
   chain_up_to(last_display_);
-  release_frames(coded.slot_decode_index);
+  release_frames(motion.slot_decode_index);
 }
 
 TrackBuilder::Result TrackBuilder::finish() {
@@ -62,19 +59,19 @@ TrackBuilder::Result TrackBuilder::finish() {
   return result;
 }
 
-void TrackBuilder::check_order(const FrameMotion& coded) const {
+void TrackBuilder::check_order(const FrameMotion& motion) const {
   const auto is_index = [](int index) { return index < std::numeric_limits<int>::max(); };
-  if (coded.width < 1 || !is_index(coded.display_index) ||
-      !std::all_of(coded.ref_display_index.begin(), coded.ref_display_index.end(), is_index)) {
+  if (motion.width < 1 || !is_index(motion.display_index) ||
+      !std::all_of(motion.ref_display_index.begin(), motion.ref_display_index.end(), is_index)) {
     throw std::invalid_argument("a width or a display_index is out of range");
   }
   if (std::any_of(frames_.begin(), frames_.end(), [&](const auto& frame) {
-        return frame->motion.decode_index == coded.decode_index;
+        return frame->motion.decode_index == motion.decode_index;
       })) {
     throw std::invalid_argument("a decode_index occurs twice");
   }
-  if (coded.display_index >= 0 &&
-      (coded.display_index <= last_display_ || is_waiting(coded.display_index))) {
+  if (motion.display_index >= 0 &&
+      (motion.display_index <= last_display_ || is_waiting(motion.display_index))) {
     throw std::invalid_argument(
         "the frames are not in bitstream order: a display_index comes twice or too late");
   }
@@ -86,18 +83,18 @@ bool TrackBuilder::is_waiting(int display_index) const {
   });
 }
 
-ChainedFrame& TrackBuilder::read_frame(const FrameMotion& coded) {
+ChainedFrame& TrackBuilder::read_frame(const FrameMotion& motion) {
   RefDetail ref_has_detail{};
   for (int ref = 1; ref < kNumRefs; ++ref) {
     ref_has_detail[ref] = std::ranges::any_of(frames_, [&](const auto& frame) {
-      return frame->motion.decode_index == coded.ref_decode_index[ref] && frame->motion.has_detail;
+      return frame->motion.decode_index == motion.ref_decode_index[ref] && frame->motion.has_detail;
     });
   }
   if (idle_frames_.empty()) idle_frames_.push_back(std::make_unique<ChainedFrame>());
   frames_.push_back(std::move(idle_frames_.back()));
   idle_frames_.pop_back();
   ChainedFrame& frame = *frames_.back();
-  read_trusted_motion(coded, options_, ref_has_detail, scratch_, frame.motion);
+  read_trusted_motion(motion, options_, ref_has_detail, scratch_, frame.motion);
   frame.order = -1;
   frame.cell_rows = grid_.cells * frame.motion.rows;
   frame.cell_cols = grid_.cells * frame.motion.cols;

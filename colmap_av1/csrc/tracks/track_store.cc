@@ -15,8 +15,7 @@ TrackStore::TrackStore(const TrackBuilderOptions& options)
 }
 
 bool TrackStore::stores(const ChainedFrame& frame) const {
-  return !stored_frames_ ||
-         std::ranges::binary_search(*stored_frames_, frame.motion.display_index);
+  return !stored_frames_ || std::ranges::binary_search(*stored_frames_, frame.motion.display_index);
 }
 
 void TrackStore::set_size(int width, int height) {
@@ -56,17 +55,16 @@ void TrackStore::count(std::int32_t index, const ChainedFrame& frame, const Cell
                        bool is_stored) {
   Track& track = tracks_[index];
   ++track.length;
-  const bool is_end = has_ends(index);
-  if (!is_stored && !is_end) return;
+  const bool is_sample = is_sampled(index);
+  if (!is_stored && !is_sample) return;
   const Observation seen = observation(frame, cell);
   if (is_stored) store(track, seen);
-  if (!is_end) return;
+  if (!is_sample) return;
   if (track.length == 1) ends_[index].first = seen;
   ends_[index].last = seen;
 }
 
-TrackStore::Observation TrackStore::observation(const ChainedFrame& frame,
-                                                const Cell& cell) const {
+TrackStore::Observation TrackStore::observation(const ChainedFrame& frame, const Cell& cell) const {
   const float scale_x = static_cast<float>(width_) / frame.motion.width;
   const float scale_y = static_cast<float>(height_) / frame.motion.height;
   return {frame.motion.display_index,
@@ -107,7 +105,7 @@ void TrackStore::release(ChainedFrame& frame) {
     free_tracks_.push_back(cell.track);
     if (track.length >= min_length_) {
       if (track.num_stored >= min_stored) keep(cell.track);
-      if (has_ends(cell.track)) {
+      if (is_sampled(cell.track)) {
         ends_[cell.track].serial = serials_[cell.track];
         kept_ends_.push_back(ends_[cell.track]);
       }

@@ -57,8 +57,8 @@ class TrackStore {
   // Releases a frame. A track that no frame holds any more ends.
   void release(ChainedFrame& frame);
 
-  // Returns the kept tracks in the order of their seeds. No frame may hold a track any more, and only
-  // `finish_ends` may be called afterwards.
+  // Returns the kept tracks in the order of their seeds. No frame may hold a track any more, and
+  // only `finish_ends` may be called afterwards.
   TrackArrays finish();
   // The ends of some of the long enough tracks, in the same order: one observation if they are the
   // same, else two.
@@ -105,7 +105,7 @@ class TrackStore {
   void store(Track& track, const Observation& observation);
   Observation observation(const ChainedFrame& frame, const Cell& cell) const;
   bool stores(const ChainedFrame& frame) const;
-  bool has_ends(std::int32_t index) const {
+  bool is_sampled(std::int32_t index) const {
     if (tracks_per_sample_ == 0) return false;
     // Fibonacci hashing: a modulus of the serial numbers, which count cells, would choose whole
     // columns of the grid of seeds.

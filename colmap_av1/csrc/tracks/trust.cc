@@ -14,7 +14,7 @@ constexpr float kConstant = -2.77F;
 constexpr float kDisagreement = 0.87F;  // times log(0.1 px + disagreement)
 constexpr float kLength = 0.71F;        // times log(1 px + length)
 constexpr float kSize = 0.28F;          // times log2 of the area over that of 8x8
-constexpr float kUncoded = 0.49F;
+constexpr float kNoResidual = 0.49F;
 constexpr float kOverlapped = 0.19F;
 constexpr float kWarped = -0.31F;
 constexpr float kNewVector = -1.37F;
@@ -34,7 +34,7 @@ float step_sigma(const StepTraits& traits) {
   float log_variance = kConstant + kDisagreement * std::log(0.1F + disagreement) +
                        kLength * std::log1p(traits.length) +
                        kSize * (std::log2(static_cast<float>(traits.block_area)) - 6.F);
-  if (!traits.coded) log_variance += kUncoded;
+  if (!traits.has_residual) log_variance += kNoResidual;
   if (traits.overlapped) log_variance += kOverlapped;
   if (traits.warped) log_variance += kWarped;
   if (has_new_vector(traits.y_mode)) log_variance += kNewVector;

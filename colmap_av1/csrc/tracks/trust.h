@@ -7,7 +7,7 @@ namespace colmap_av1::tracks {
 struct StepTraits {
   int block_area = 16;  // px^2
   int y_mode = 0;
-  bool coded = false;  // has a residual
+  bool has_residual = false;
   bool warped = false;
   bool overlapped = false;  // OBMC
   float length = 0.F;       // of the displacement, px

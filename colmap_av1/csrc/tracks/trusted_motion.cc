@@ -10,8 +10,8 @@
 
 #include "av1/constants.h"
 #include "av1/spec_tables.h"
-#include "tracks/displacement.h"
 #include "tracks/affine_motion.h"
+#include "tracks/displacement.h"
 #include "tracks/fill_motion.h"
 #include "tracks/trust.h"
 
@@ -84,9 +84,10 @@ std::int32_t kept_warp(const FrameMotion& frame, const Displacement& d) {
                                           : d.warp - frame.local_warp_params.data());
 }
 
-bool is_small_enough(const TrackBuilderOptions& options, int block_area, bool coded) {
+bool is_small_enough(const TrackBuilderOptions& options, int block_area, bool has_residual) {
   if (options.max_block_area && block_area > *options.max_block_area) return false;
-  return coded || !options.max_uncoded_block_area || block_area <= *options.max_uncoded_block_area;
+  return has_residual || !options.max_uncoded_block_area ||
+         block_area <= *options.max_uncoded_block_area;
 }
 
 // Whether both ends of a motion keep a distance from the edge of the picture.
@@ -121,20 +122,21 @@ bool shows_detail(const FrameMotion& frame, const TrackBuilderOptions& options,
                   const RefDetail& ref_has_detail) {
   int num_units = 0;
   int num_detailed = 0;
-  int num_coded = 0;
+  int num_with_residual = 0;
   std::array<int, kNumRefs> num_linked{};
   visit_spread_units(motion, [&](int unit) {
     const int area = motion.block_area(unit);
-    const bool coded = frame.block(unit).skip == 0;
+    const bool has_residual = frame.block(unit).skip == 0;
     const int ref = model.at(unit, 0).ref;
     ++num_units;
-    num_detailed += is_small_enough(options, area, coded) && (ref != 0 || area < kPlainIntraArea);
-    num_coded += coded;
+    num_detailed +=
+        is_small_enough(options, area, has_residual) && (ref != 0 || area < kPlainIntraArea);
+    num_with_residual += has_residual;
     ++num_linked[ref];
   });
   if (num_detailed >= kDetail * num_units) return true;
   const auto main_ref = std::ranges::max_element(num_linked) - num_linked.begin();
-  return num_coded <= kRepeat * num_units && ref_has_detail[main_ref];
+  return num_with_residual <= kRepeat * num_units && ref_has_detail[main_ref];
 }
 
 // The affine motion in the frame's first list. There is none if all blocks are small enough, if
@@ -146,9 +148,9 @@ AffineMotion common_motion(const FrameMotion& frame, const TrackBuilderOptions& 
   int num_large = 0;
   std::vector<TimedMotion> spread;
   visit_spread_units(motion, [&](int unit) {
-    const bool coded = frame.block(unit).skip == 0;
+    const bool has_residual = frame.block(unit).skip == 0;
     ++num_units;
-    num_large += !is_small_enough(options, motion.block_area(unit), coded);
+    num_large += !is_small_enough(options, motion.block_area(unit), has_residual);
     const Displacement d = model.at(unit, 0);
     if (d.ref != 0) spread.push_back(timed(motion, motion.unit_centre(unit), d));
   });
@@ -249,7 +251,7 @@ Verdict judge_block(const FrameMotion& frame, const TrackBuilderOptions& options
   StepTraits traits;
   traits.block_area = motion.block_area(unit);
   traits.y_mode = frame.block(unit).y_mode;
-  traits.coded = frame.block(unit).skip == 0;
+  traits.has_residual = frame.block(unit).skip == 0;
   traits.warped = own.warp >= 0;
   traits.overlapped = frame.block(unit).motion_mode == av1::OBMC;
   traits.length = std::hypot(own.dx, own.dy);
