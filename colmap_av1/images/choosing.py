@@ -32,7 +32,8 @@ from colmap_av1.util.grouping import grouped
 from colmap_av1.util.texts import read_lines
 
 _Image = NDArray[np.uint8]
-# Yields (display index, picture) of some frames, given by their indices, in order; None: all.
+# Yields (frame number, picture) of some frames, given by their numbers, in order; None: all. Frames
+# are numbered as players show them, from 0.
 _Decode = Callable[[Collection[int] | None], Iterable[tuple[int, _Image]]]
 
 # Longer side in pixels at which sharpness is measured.
@@ -58,7 +59,7 @@ class ChosenImages:
 
     Attributes:
         names: name of each image, its path relative to the image folder.
-        frames: int32 [n] display index of each image, strictly ascending.
+        frames: int32 [n] frame number of each image, strictly ascending.
     """
 
     names: list[str]
@@ -66,7 +67,7 @@ class ChosenImages:
 
     @property
     def frame_of(self) -> dict[str, int]:
-        """The display index of each image, by name."""
+        """The frame number of each image, by name."""
         return dict(zip(self.names, self.frames.tolist(), strict=True))
 
     def some(self, index: Sequence[int] | NDArray[np.integer[Any]]) -> ChosenImages:
@@ -98,7 +99,7 @@ def choose_images(
         existing: names of existing images, in any order.
         folder: folder of the images; None: no picture is decoded.
         times: returns the times of the frames in seconds; None if unknown.
-        decode: yields (display index, picture) of some frames, given by their indices, or with
+        decode: yields (frame number, picture) of some frames, given by their indices, or with
             None of all frames.
         tracks: tracks through all frames if new images are spread in parallax; else None.
         of_model: the existing images are those of a model, so `frame_list` may list more.

@@ -246,7 +246,7 @@ def write_images(
         video: the video file.
         folder: folder for the images; created if missing.
         names: the images' names, which may contain folders.
-        frames: display index of each image.
+        frames: frame number of each image.
         num_threads: number of threads; None: one per CPU.
         operating_point: operating point of a scalable stream.
         change: called on several threads with (display_index, picture) of each missing image;

@@ -32,7 +32,7 @@ def key_images(
 
     Args:
         tracks: tracks of the whole video that poses may be estimated from.
-        frames: int32 [num_images] display index of each image, ascending.
+        frames: int32 [num_images] frame number of each image, ascending.
         always: bool [num_images] images that become key images in any case.
         spacing: width in pixels of the cells of an image that are counted.
         num_cells: number of cells with tracks beyond which an image needs no more.

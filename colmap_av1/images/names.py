@@ -33,7 +33,7 @@ def image_names(pattern: str, frames: Sequence[int]) -> list[str]:
     """Name the images of frames by a printf pattern such as 'frame_%06d.png'.
 
     Args:
-        pattern: file name with one integer field, which takes the display index from 0.
+        pattern: file name with one integer field, which takes the frame number, from 0.
         frames: display indices.
 
     Raises:
@@ -65,7 +65,7 @@ def frames_of_images(
         first_number: number in the name of the video's first frame, usually 0 or 1; None: inferred.
 
     Returns:
-        int32 [len(names)] display index of each image.
+        int32 [len(names)] frame number of each image.
 
     Raises:
         ImageError: count and names do not determine the frames.

@@ -35,7 +35,7 @@ from colmap_av1.tracks.video_tracks import VideoSource, open_source
 from colmap_av1.util.progress import Progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.decoding import decode_frames
-from colmap_av1.video.display import Display, shown_size, turned_back
+from colmap_av1.video.display import UPRIGHT, Display, shown_size, turned_back
 from colmap_av1.video.facts import Video, count_shown
 from colmap_av1.video.unchanged import unchanged
 
@@ -209,7 +209,7 @@ def _fit(
     back = _way_back(video, existing, folder)
     if back is not None:
         # The images were written by a program that does not rotate pictures.
-        display = replace(display, turn=Display().turn, pixel_aspect=back.pixel_aspect)
+        display = replace(display, turn=UPRIGHT, pixel_aspect=back.pixel_aspect)
         video_size = shown_size(video_size, back)
     size = size_of_images(existing, video_size, display.pixel_aspect)
     return _Fit(existing, display, video_size, size)
@@ -280,7 +280,7 @@ def _way_back(
     FFmpeg show them.
     """
     display = video.display
-    if display.turn == Display().turn or not existing:
+    if display.turn == UPRIGHT or not existing:
         return None
     back = turned_back(display)
     name, size = next(iter(existing.items()))

@@ -44,7 +44,7 @@ def frames_by_content(
 
     Args:
         files: image files of any size with the video's aspect ratio.
-        pictures: (display index, uint8 [h, w, 3] BGR) of all frames, in order.
+        pictures: (frame number, uint8 [h, w, 3] BGR) of all frames, in order.
 
     Returns:
         int32 [len(files)] display indices, all different.
@@ -99,7 +99,7 @@ def check_content(
     Args:
         files: image files.
         frames: the frame that each image should show, ascending.
-        pictures: (display index, picture) of `frames_near` or more frames, in order; not read
+        pictures: (frame number, picture) of `frames_near` or more frames, in order; not read
             beyond the last needed one.
 
     Raises:
@@ -131,7 +131,7 @@ def is_turned_back(path: Path, pictures: Iterable[tuple[int, _Image]], display: 
 
     Args:
         path: the image file.
-        pictures: (display index, picture) of all frames as players show them.
+        pictures: (frame number, picture) of all frames as players show them.
         display: how players show them.
 
     Raises:

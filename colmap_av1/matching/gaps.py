@@ -105,7 +105,7 @@ def low_inter_gaps(
 
     Args:
         inter_share: as for `low_inter_frames`.
-        frames: int32 [num_images] display index of each image, ascending.
+        frames: int32 [num_images] frame number of each image, ascending.
         certain: as for `low_inter_frames`.
 
     Returns:

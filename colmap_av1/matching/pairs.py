@@ -28,7 +28,7 @@ class ImageKeypoints:
     """Keypoints of one image, one for each track that it observes.
 
     Attributes:
-        frame: display index of the image's video frame.
+        frame: frame number of the image's video frame.
         xy: float32 [n, 2] position in pixels, (x right, y down), origin at the top-left
             corner of the image: the first pixel's centre is (0.5, 0.5).
         track: int64 [n] track of each keypoint, strictly ascending.
@@ -46,7 +46,7 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
 
     Args:
         tracks: tracks of the whole video.
-        frames: display index of each image, strictly ascending.
+        frames: frame number of each image, strictly ascending.
 
     Returns:
         One entry per frame, in the same order.

@@ -188,7 +188,7 @@ class Structure:
         num_shown: number of frames that the bitstream shows.
         num_intra_frames: number of key frames and intra-only frames.
         later_units: number of units in all frames after the first.
-        inter_units: number of these units that are inter coded.
+        inter_units: number of these units that refer to another frame.
         inter_share_of: share of inter units in each shown frame, by its display index.
     """
 

@@ -35,7 +35,7 @@ class ImageOptions(Options):
 
     image_name: str = option(
         "frame_%06d",
-        "file name of new images; the number is the frame's display index, from 0; the extension "
+        "file name of new images; the number is that of the frame, from 0; the extension "
         ".png or .jpg chooses the format (default PNG, JPEG in reconstruct)",
     )
     num_images: int | None = option(

@@ -65,7 +65,7 @@ def refine_tracks(
 
     Args:
         tracks: tracks of the whole video.
-        frames: (display index, picture) of the frames in display order, uint8 BGR
+        frames: (frame number, picture) of the frames in display order, uint8 BGR
             [height, width, 3] or grey [height, width]. Observations in frames that are
             missing keep the bitstream's step.
         options: how to refine.
@@ -108,7 +108,7 @@ def refine_spread_tracks(
     Args:
         tracks: tracks of the whole video.
         frames: int32 [n] frames that are images, ascending.
-        pictures: (display index, picture) of these frames, see `refine_tracks`.
+        pictures: (frame number, picture) of these frames, see `refine_tracks`.
         progress: called after each picture with the number of pictures so far.
 
     Returns:

@@ -360,7 +360,7 @@ def build_tracks(
 
     Frames are chained in display order, and links to the nearest frame come first, so that a frame
     that was coded far ahead is reached in short steps. Frames that are never shown are chained
-    through last. A unit without coded motion moves like the units on both sides of it if these
+    through last. A unit without a motion vector moves like the units on both sides of it if these
     agree. Frames are consumed one by one. In addition to a few frames of motion, memory grows only
     with the observations.
 

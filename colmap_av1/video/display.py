@@ -14,7 +14,7 @@ _QUARTER_TURN_TOLERANCE = 0.02
 
 Turn = tuple[tuple[int, int], tuple[int, int]]
 
-_UPRIGHT: Turn = ((1, 0), (0, 1))
+UPRIGHT: Turn = ((1, 0), (0, 1))
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Display:
     """
 
     crop: tuple[int, int, int, int] = (0, 0, 0, 0)
-    turn: Turn = _UPRIGHT
+    turn: Turn = UPRIGHT
     pixel_aspect: float = 1.0
 
     @property
@@ -113,7 +113,7 @@ def shown_points(
         float32 [n, 2], origin at the shown picture's top-left corner; points that are cropped
         lie outside the picture. The same array if pictures are shown as they are stored.
     """
-    if display.turn == _UPRIGHT and not any(display.crop):
+    if display.turn == UPRIGHT and not any(display.crop):
         return stored
     turn = np.array(display.turn, dtype=np.float32)
     left, top, _, _ = display.crop

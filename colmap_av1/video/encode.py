@@ -43,7 +43,7 @@ from colmap_av1.video.encoders import (
 from colmap_av1.video.facts import Video, read_video, with_counted_packets
 from colmap_av1.video.metadata.positions import read_positions
 from colmap_av1.video.metadata.telemetry import carrying, loss_of
-from colmap_av1.video.stored_frames import count_frames
+from colmap_av1.video.stored_frames import count_decodable
 from colmap_av1.video.unchanged import unchanged
 
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".webm": "webm", ".ivf": "ivf"}
@@ -357,7 +357,7 @@ def _readable_frames(video: VideoFile, count: int, strict: bool) -> int:
     """
     if count == video.num_packets:
         return count
-    readable, damage = count_frames(video)
+    readable, damage = count_decodable(video)
     if damage is None and readable == count:
         return count
     if damage is None or readable > count:

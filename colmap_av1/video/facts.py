@@ -26,7 +26,7 @@ from colmap_av1.video.container import (
     open_container,
     until_damage,
 )
-from colmap_av1.video.display import Display, shown_size, turn_of_matrix
+from colmap_av1.video.display import UPRIGHT, Display, shown_size, turn_of_matrix
 from colmap_av1.video.metadata.spherical import projection_of
 from colmap_av1.video.stored_frames import decode_stream
 from colmap_av1.video.unchanged import file_state
@@ -113,7 +113,7 @@ def _display(
 ) -> Display:
     """How a decoded frame is shown; `crop` and `stored_aspect` come from its container."""
     matrix = next((d for d in frame.side_data if d.type.name == "DISPLAYMATRIX"), None)
-    turn = Display().turn if matrix is None else turn_of_matrix(struct.unpack("=9i", matrix))
+    turn = UPRIGHT if matrix is None else turn_of_matrix(struct.unpack("=9i", matrix))
     if turn is None:
         raise VideoError(
             f"{path}: its display rotation is not a multiple of 90 degrees: "

@@ -22,7 +22,7 @@ from colmap_av1.video.container import (
 )
 
 
-def count_frames(video: str | os.PathLike[str]) -> tuple[int, str | None]:
+def count_decodable(video: str | os.PathLike[str]) -> tuple[int, str | None]:
     """Count the frames of a file of any codec up to the first damage, and describe the damage.
 
     Raises:

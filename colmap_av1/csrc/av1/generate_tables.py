@@ -328,9 +328,7 @@ def _constexpr_header(tables: list[_Table]) -> str:
     )
 
 
-def _constants_header(
-    symbols: dict[str, int], enumerations: dict[str, int], used: set[str]
-) -> str:
+def _constants_header(symbols: dict[str, int], enumerations: dict[str, int], used: set[str]) -> str:
     def lines(constants: dict[str, int]) -> str:
         return "\n".join(
             f"inline constexpr int {n} = {v};" for n, v in constants.items() if n in used

@@ -100,7 +100,7 @@ nb::tuple find_patches(const InputArray<std::uint8_t, nb::ndim<3>>& patches, con
                        const InputArray<float, nb::shape<-1, 2, 2>>& change, const Picture& target,
                        const Positions& start, float max_move) {
   if (patches.shape(1) != patches.shape(2)) {
-    throw nb::value_error("patches are no squares");
+    throw nb::value_error("patches are not square");
   }
   geometry::FoundPatches found;
   {
@@ -257,7 +257,7 @@ void bind_geometry(nb::module_& m) {
         "view"_a, "rays"_a, "xyz"_a, "offsets"_a, "observation"_a,
         "Reprojection error in pixels of each observation of points, inf behind the camera.");
   m.def("widest_angles", &widest_angles, nb::kw_only(), "centres"_a, "xyz"_a, "offsets"_a, "view"_a,
-        "Largest triangulation angle of each point in radians, slightly too small at worst.");
+        "Largest triangulation angle of each point in radians; it may be slightly too small.");
   m.def("floater_observations", &floater_observations, nb::kw_only(), "cam_from_world"_a, "focal"_a,
         "view"_a, "rays"_a, "xyz"_a, "offsets"_a, "observation"_a, "distance_share"_a,
         "near_ratio"_a, "support"_a, "square_width"_a, "fewest_in_square"_a,

@@ -108,7 +108,7 @@ void run_points(Input& input) {
                                                 .fewest_in_square = input.byte() % 9});
     for (std::size_t i = 0; i < counts.size(); ++i) {
       check(counts[i] >= 0 && counts[i] <= rows[i + 1] - rows[i],
-            "points hang in images that see them");
+            "counts are at most the observations of the point");
     }
   });
   refused_or([&] {

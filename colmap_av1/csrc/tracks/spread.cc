@@ -19,7 +19,8 @@ void check(const TrackView& tracks, std::span<const std::int64_t> order) {
   }
   const auto num_tracks = static_cast<std::int64_t>(tracks.offsets.size()) - 1;
   for (const std::int64_t track : order) {
-    if (track < 0 || track >= num_tracks) throw std::invalid_argument("order names no track");
+    if (track < 0 || track >= num_tracks)
+      throw std::invalid_argument("order holds an index of no track");
   }
   for (const std::int32_t frame : tracks.frame) {
     if (frame < 0 || frame >= tracks.num_frames) {
