@@ -39,7 +39,6 @@ from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.mapper_limits import FORWARD_MOTION, SMALL_ANGLES
 from colmap_av1.matching.match_images import (
     ImageMatches,
-    ImageMatchOptions,
     SelectedTracks,
     match_images,
 )
@@ -59,7 +58,6 @@ from colmap_av1.poses.run import Run
 from colmap_av1.poses.start_trials import demote_failing_starts
 from colmap_av1.poses.track_stage import VideoTracks, encoding_for_pictures
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import least_length
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import check_outside, scratch_folder
@@ -301,7 +299,7 @@ def match(
             # Without depth, there is no good start.
             if found.depth.is_observable and not start.is_tried:
                 written = demote_failing_starts(
-                    start, names, found.cameras, context, fixed_intrinsics=fixed_intrinsics
+                    start, names, found.cameras, clock, fixed_intrinsics=fixed_intrinsics
                 )
         except ModelError:
             crash = (
@@ -631,9 +629,7 @@ def _match_pairs(
         pictures_of(
             image_set, images.shown, [photo.path for photo in images.inputs.photos], options.reading
         ),
-        options=ImageMatchOptions(
-            options.pairs, options.verify, options.links, least_length(options.tracks)
-        ),
+        options=options,
         context=context,
         name=images.inputs.name,
     )

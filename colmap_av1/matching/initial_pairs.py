@@ -105,8 +105,8 @@ def prepare_start(
     register, and with forward motion the mapper might find no pair at all.
 
     If poses are known of several models, the mapper begins several times. Pairs with a wrong pose
-    keep fewer inliers than it ever accepts, too, and bad pairs of each model are demoted as those
-    of the first.
+    and at least 50 inliers keep fewer inliers than it ever accepts, too, and bad pairs of each
+    model are demoted as those of the first.
 
     Args:
         matched: the images. The pose of the homography is tested only for pairs with an essential

@@ -23,8 +23,8 @@ from colmap_av1.matching.image_matches import (
 )
 from colmap_av1.matching.links.link_images import link_images
 from colmap_av1.matching.links.report import LinkReport
-from colmap_av1.options import LinkOptions, PairOptions, VerifyOptions
-from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.options import MatchOptions
+from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.util.run_context import RunContext
 
 
@@ -43,23 +43,6 @@ class SelectedTracks:
     tracks: Tracks
     inter_share: NDArray[np.float32]
     fast: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class ImageMatchOptions:
-    """The options of matching.
-
-    Attributes:
-        pairs: which images are paired.
-        verify: how pairs are verified.
-        links: where images are linked by SIFT features.
-        min_length: fewest frames of a track.
-    """
-
-    pairs: PairOptions
-    verify: VerifyOptions
-    links: LinkOptions
-    min_length: int
 
 
 @dataclass(frozen=True)
@@ -94,7 +77,7 @@ def match_images(
     cameras: Callable[[PairedImages], ImageCameras],
     pictures: Pictures,
     *,
-    options: ImageMatchOptions,
+    options: MatchOptions,
     context: RunContext,
     name: str,
     images_apart: float = 1.0,
@@ -154,7 +137,7 @@ def match_images(
 def pair_videos(
     image_set: ImageSet,
     videos: Sequence[SelectedTracks],
-    options: ImageMatchOptions,
+    options: MatchOptions,
     context: RunContext,
 ) -> PairedImages:
     """Match the images of each video along its tracks, see `match_images`."""
@@ -167,7 +150,7 @@ def pair_videos(
             video.tracks,
             fast=video.fast,
             links=options.links,
-            min_length=options.min_length,
+            min_length=least_length(options.tracks),
         )
         paired.append(
             pair_images(
@@ -175,7 +158,7 @@ def pair_videos(
                 video.tracks,
                 chosen,
                 options.pairs,
-                min_length=options.min_length,
+                min_length=least_length(options.tracks),
                 context=context,
                 needed=image_set.num_sequences == 1 and not examines_pictures,
             )

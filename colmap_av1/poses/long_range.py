@@ -35,7 +35,7 @@ _GAP = 10
 _MIN_OVERLAP = 0.5
 _MAX_ANGLE = 30.0
 _MAX_SCALE = 2.0
-# Number of points of an image that are projected.
+# About the number of points of an image that are projected.
 _NUM_POINTS = 200
 _NUM_PAIRS = 12
 _NUM_FEATURES = 1500

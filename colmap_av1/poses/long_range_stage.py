@@ -26,7 +26,7 @@ from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.stages import Kept, run_stage
 
-# Largest number of tracks whose points determine which images overlap; short ones are ignored.
+# About the number of tracks whose points determine which images overlap; short ones are ignored.
 _NUM_TRACKS = 10_000
 
 

@@ -18,7 +18,6 @@ from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.match_images import (
     ImageMatches,
-    ImageMatchOptions,
     SelectedTracks,
     match_images,
     pair_videos,
@@ -28,7 +27,7 @@ from colmap_av1.options import DensityOptions
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import VideoTracks, key_images_of_video, pose_tracks, tracks_of
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import Tracks, least_length
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 
 _LINKS = "links.npz"
@@ -210,9 +209,6 @@ def _match_images(
         # Mappers rarely converge with many focal lengths. The adjustment gives images their own.
         camera = replace(camera, single_camera=None)
     context = run.context
-    groups = ImageMatchOptions(
-        options.pairs, options.verify, options.links, least_length(options.tracks)
-    )
     keyed = image_set.some(index)
 
     def cameras(paired: PairedImages) -> ImageCameras:
@@ -221,7 +217,7 @@ def _match_images(
         shown, photos = run.shown, run.inputs.photos
         if camera.camera_params is not None or len(index) == len(image_set.sequence):
             return new_cameras(paired, keyed, shown, photos, camera, context=context)
-        every = pair_videos(image_set, _selected_tracks(run, videos, image_set), groups, context)
+        every = pair_videos(image_set, _selected_tracks(run, videos, image_set), options, context)
         made = new_cameras(every, image_set, shown, photos, camera, context=context)
         return replace(made, of_images=[made.of_images[i] for i in index])
 
@@ -231,7 +227,7 @@ def _match_images(
         run.inputs.no_motion,
         cameras,
         run.pictures(keyed),
-        options=groups,
+        options=options,
         context=context,
         name=run.inputs.name,
         images_apart=image_set.images_of(len(videos)).start / keyed.images_of(len(videos)).start,

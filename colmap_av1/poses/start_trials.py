@@ -23,7 +23,7 @@ from colmap_av1.matching.initial_pairs import PreparedStart, are_far, with_demot
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
-from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.progress import Clock
 
 # A start has succeeded with this number of images, or with half of all images. It is the least
 # number that COLMAP's mapper requires of a model, except of the first (min_model_size).
@@ -38,7 +38,7 @@ def demote_failing_starts(
     start: PreparedStart,
     names: Sequence[str],
     cameras: Sequence[pycolmap.Camera],
-    context: RunContext,
+    clock: Clock,
     *,
     fixed_intrinsics: bool = False,
 ) -> MatchedImages:
@@ -52,7 +52,7 @@ def demote_failing_starts(
         start: the images, and the mapper's limits.
         names: names of the images.
         cameras: the camera of each image.
-        context: its clock gets the stage "verification".
+        clock: gets the stage "verification".
         fixed_intrinsics: whether `match` prints that the mapper keeps the intrinsics.
 
     Returns:
@@ -80,7 +80,7 @@ def demote_failing_starts(
             write_matches(database, names, known, matched)
             return start_mapper(database, options, num_images, log=log, initial_pair=initial_pair)
 
-    with context.clock.measure("verification"):
+    with clock.measure("verification"):
         return _without_failing_starts(start.matched, names, failing_start)
 
 

@@ -20,7 +20,7 @@ from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import CameraOptions
 from colmap_av1.poses.start_trials import demote_failing_starts
-from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.progress import Clock
 
 CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
 NUM_IMAGES = 16
@@ -97,7 +97,7 @@ def test_pair_from_which_no_model_grows_is_demoted(
 ) -> None:
     assert num_registered(with_moving_object, tmp_path / "before")[0] < NUM_IMAGES / 2
     start = prepared(with_moving_object)
-    found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, RunContext())
+    found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, Clock())
     assert num_registered(found, tmp_path / "after") == [NUM_IMAGES]
     counts = [len(geometry.inlier_matches) for geometry in found.geometries[-3:]]
     assert 15 <= min(counts) < INITIAL_MIN_INLIERS / 2
@@ -105,7 +105,7 @@ def test_pair_from_which_no_model_grows_is_demoted(
 
 def test_pairs_keep_their_inliers_if_the_mapper_starts_well(scene: MatchedImages) -> None:
     start = prepared(scene)
-    found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, RunContext())
+    found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, Clock())
     assert found.geometries == scene.geometries
 
 
@@ -117,5 +117,5 @@ def test_pairs_keep_their_inliers_if_no_start_succeeds(with_moving_object: Match
         geometries=with_moving_object.geometries[-3:],
     )
     start = prepared(alone)
-    found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, RunContext())
+    found = demote_failing_starts(start, NAMES, [CAMERA] * NUM_IMAGES, Clock())
     assert found.geometries == alone.geometries
