@@ -703,8 +703,8 @@ def _words_of(options: Options) -> list[str]:
 
 
 def _path_word(path: Path) -> str:
-    """The path as a shell word that programs do not take for an option."""
-    return f"./{path}" if str(path).startswith("-") else str(path)
+    """The path as a shell word that programs do not take for an option or an address of SQLite."""
+    return f"./{path}" if str(path).startswith(("-", "file:")) else str(path)
 
 
 def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseImage]:

@@ -36,6 +36,7 @@ from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import count_through
 from colmap_av1.images.inputs import labels_of, read_inputs
+from colmap_av1.map import map_database
 from colmap_av1.match import match
 from colmap_av1.options import (
     CameraOptions,
@@ -379,6 +380,21 @@ def test_reconstruct_joins_videos_and_photos_in_one_model(
 
     resumed = reconstruct(halves, tmp_path / "out", photos=photos, options=options)
     assert {"tracks_walk_in", "tracks_back", "matches", "poses", "model"} <= set(resumed.resumed)
+
+
+def test_densify_leaves_out_videos_that_a_model_lacks(
+    halves: tuple[Path, Path], tmp_path: Path
+) -> None:
+    images = tmp_path / "images"
+    apart = MatchOptions(links=LinkOptions(links="none"))
+    match(tmp_path / "a.db", halves, image_path=images, options=apart)
+    mapped = map_database(tmp_path / "a.db", images, tmp_path / "models")
+    assert sorted(mapped.num_registered) == sorted([len(FIRST), len(SECOND)])
+    for number, size in enumerate(mapped.num_registered):
+        model, output = mapped.output / str(number), tmp_path / f"dense_{number}"
+        report = densify(model, halves, output, image_path=images)
+        assert report.num_images == size
+        assert any("no image" in warning for warning in report.warnings)
 
 
 def test_unconnected_videos_become_models_in_separate_folders(

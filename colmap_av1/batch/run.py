@@ -133,13 +133,13 @@ def run_batch(
     number, count = options.part
     shard = "" if options.shard is None else f"-{number}-of-{count}"
     start = time.perf_counter()
+    everything, num_repeated = list_videos([os.fspath(w) for w in words], place, options.stall)
     with ExitStack() as opened:
         into = output_at(place)
         opened.enter_context(into.opened(shard))
         _refuse_another_task(into, place, work.task)
         _refuse_files_of_others(into, place, shard)
         _check_scratch(work.scratch)
-        everything, num_repeated = list_videos([os.fspath(w) for w in words], place, options.stall)
         videos = everything[number - 1 :: count]
         engine = (
             LocalEngine(work, options, len(videos))

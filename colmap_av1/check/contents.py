@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,8 @@ _MODEL_OF_CONFIG = {
 # reported. The maximum is not used, because a wrong model may give any angle.
 _NUM_DEEPEST = 24
 _ANGLE_QUANTILE = 0.9
+# The last camera model of COLMAP 3.8.
+_LAST_OLD_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,18 @@ class Pairs:
     def used(self) -> NDArray[np.bool_]:
         """Pairs that the mappers of all COLMAP versions use, bool [m]."""
         return (self.num_inliers >= MIN_INLIERS) & ~np.isin(self.config, UNUSED_CONFIGS)
+
+
+def readers_of(cameras: Iterable[pycolmap.Camera], of_layout: str) -> str:
+    """COLMAP versions that open a database.
+
+    Args:
+        cameras: its cameras.
+        of_layout: versions that open its layout.
+    """
+    newer = {c.model_name for c in cameras if int(c.model) > _LAST_OLD_MODEL}
+    needed = ", ".join(sorted(newer))
+    return f"{of_layout}, if they have the camera model {needed}" if newer else of_layout
 
 
 def layout_of(connection: sqlite3.Connection) -> tuple[str, str]:

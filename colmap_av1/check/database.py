@@ -16,6 +16,7 @@ from colmap_av1.check.contents import (
     layout_of,
     pairs_with_rows,
     parallax_of,
+    readers_of,
 )
 from colmap_av1.check.findings import (
     Finding,
@@ -164,7 +165,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> DatabaseCheck:
         database=path,
         user_version=connection.execute("PRAGMA user_version").fetchone()[0],
         layout=layout,
-        readers=readers,
+        readers=readers_of(cameras.values(), readers),
         num_images=len(images.ids),
         num_cameras=len(cameras),
         num_priors=sum(bool(camera.has_prior_focal_length) for camera in cameras.values()),

@@ -97,10 +97,12 @@ def _reason(error: BaseException | None) -> str:
 def _import_libraries(*, with_pycolmap: bool) -> None:
     """Import NumPy, and then pycolmap if it is needed.
 
+    OpenCV prints no messages about damaged files, since errors name these.
     NumPy's matrix products get one thread, because further threads would wait for work in a busy
     loop. pycolmap installs a handler for SIGTERM that prints a C++ stack trace and may hang, so the
     previous handlers are restored.
     """
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     given = os.environ.get(BLAS_THREADS)
     with held_back(), handlers_kept():
         os.environ.setdefault(BLAS_THREADS, "1")

@@ -8,7 +8,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -309,13 +309,16 @@ def _read_entries(
             name = words[1].strip() if len(words) == 2 else options.file_name % frame
         else:
             name = line.strip()
-            found = last_number(name)
-            if found is None:
+            found, extension = last_number(name), PurePosixPath(name).suffix[1:]
+            if found is None or not extension or extension.isdecimal():
                 raise ImageError(
-                    f"{path}, line {number}: '{name}' has no frame number: give the frame's index"
+                    f"{path}, line {number}: '{name}' is neither the index of a frame nor the name "
+                    "of an image with a number"
                 )
             frame = found - (options.first_number or 0)
         entries.append((number, frame, name))
+    if not entries:
+        raise ImageError(f"{path}: lists no frame: give a frame's index on each line")
     for what, values in (
         ("frame", [str(f) for _, f, _ in entries]),
         ("name", [n for _, _, n in entries]),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,6 +53,25 @@ class Inputs:
     def states(self) -> tuple[FileState, ...]:
         """The states of all files at the start."""
         return (*(video.state for video in self.videos), *(photo.state for photo in self.photos))
+
+    def with_images_in(self, names: Collection[str]) -> Inputs:
+        """Leave out videos of which a model has no image, with a warning.
+
+        A mapper makes separate models of videos that nothing connects.
+
+        Args:
+            names: names of the model's images.
+        """
+        kept = [any(name.startswith(f"{label}/") for name in names) for label in self.labels]
+        if all(kept) or not any(kept):
+            return self
+        left_out = [str(v) for v, is_kept in zip(self.videos, kept, strict=True) if not is_kept]
+        return replace(
+            self,
+            videos=tuple(itertools.compress(self.videos, kept)),
+            labels=tuple(itertools.compress(self.labels, kept)),
+            warnings=(*self.warnings, f"the model has no image of {', '.join(left_out)}"),
+        )
 
     @property
     def no_motion(self) -> NDArray[np.float32]:

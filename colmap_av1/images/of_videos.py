@@ -36,13 +36,13 @@ def images_of_videos(
     """Assign the images of a model, given as (width, height) by name, to the videos.
 
     Raises:
-        ModelError: the model has an image of another video, or no image of a video.
+        ModelError: the model has an image of another video, or none of a video.
         ImageError: images do not fit their video.
     """
     photos = {photo.name for photo in inputs.photos}
     of_label: dict[str, dict[str, tuple[int, int]]] = {label: {} for label in inputs.labels}
     for name in sorted(sizes.keys() - photos):
-        label, _, own = name.partition("/") if len(of_label) > 1 else ("", "", name)
+        label, _, own = name.partition("/") if any(of_label) else ("", "", name)
         if label not in of_label:
             raise ModelError(
                 f"{model}: image '{name}' is not in a folder of a video ({', '.join(of_label)}): "

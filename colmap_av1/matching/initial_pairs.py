@@ -155,7 +155,8 @@ def prepare_start(
             for number in range(1, len(known)):
                 own = search.of_model(number)
                 demote = own.bad_pairs_of_limits([limits, *limits.relaxed], demote, most)
-            is_tried = not search.has_untried_pair
+            # Where the mapper begins after its first model is not certain.
+            is_tried = len(known) == 1 and not search.has_untried_pair
     return PreparedStart(with_demoted(matched, demote, most), limits, is_certain, is_tried)
 
 

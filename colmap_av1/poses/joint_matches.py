@@ -152,7 +152,7 @@ def match_jointly(
     left = [name for name in image_set.images.names if name not in registered]
     num_images = len(image_set.sequence)
     # Images of uncertain models do not count: without the estimate, their models would be bent.
-    if len(left_out.union(registered)) < (1 - _MAX_LEFT) * num_images:
+    if len(left_out.union(registered)) <= (1 - _MAX_LEFT) * num_images:
         raise ModelError(
             f"the joint estimate registers only {num_images - len(left)} of {num_images} images: "
             "match them pair by pair with --verify pairs"

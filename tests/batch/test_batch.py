@@ -30,6 +30,7 @@ from colmap_av1 import (
 )
 from colmap_av1.batch.run import Counts
 from colmap_av1.cli import main
+from colmap_av1.errors import ColmapAv1Error
 
 ONCE = BatchOptions(retries=0)
 SMALL = MatchOptions(
@@ -250,6 +251,12 @@ def test_names_of_videos_need_not_be_utf_8(clips: Path, tmp_path: Path) -> None:
     assert rows_of(out)[0]["name"] == name.removesuffix(".mp4")
     assert run_batch(videos, out, ReadOptions(), options=ONCE).num_kept == 1
     assert main(["batch", "report", "--output", str(out), "--quiet"]) == 0
+
+
+def test_inputs_without_videos_leave_no_output(tmp_path: Path) -> None:
+    with pytest.raises(ColmapAv1Error):
+        run_batch(tmp_path / "nothing", tmp_path / "out", ReadOptions())
+    assert not list(tmp_path.iterdir())
 
 
 def test_invalid_options_are_errors(clips: Path, tmp_path: Path) -> None:

@@ -75,6 +75,14 @@ def test_report_of_a_new_database(tmp_path: Path) -> None:
     assert {finding.severity for finding in report.findings} <= {"note"}
 
 
+def test_versions_without_a_camera_model_are_not_named(tmp_path: Path) -> None:
+    """COLMAP 3.8 aborts on camera models that it does not know."""
+    path = tmp_path / "new.db"
+    camera = pycolmap.Camera(model="DIVISION", width=WIDTH, height=HEIGHT, params=[300] * 4 + [0])
+    write_matches(path, NAMES, camera, OURS)
+    assert "DIVISION" in check_database(path).readers
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_report_of_a_sift_database(tmp_path: Path, layout: str) -> None:
     path = tmp_path / "sift.db"

@@ -78,7 +78,7 @@ class LinkReport:
         if self.num_images == 0:
             names = ", ".join(f"'{name}'" for part in self.parts for name in part)
             return (f"{names} are not connected with --links none: they become separate models",)
-        groups = " from ".join(", ".join(f"'{name}'" for name in part) for part in self.parts)
+        groups = " with ".join(", ".join(f"'{name}'" for name in part) for part in self.parts)
         return (
             f"nothing in the pictures connects {groups}: they become {len(self.parts)} separate "
             "models; film what both have in view, or match videos of different scenes separately",
