@@ -99,7 +99,7 @@ def choose_images(
         existing: names of existing images, in any order.
         folder: folder of the images; None: no picture is decoded.
         times: returns the times of the frames in seconds; None if unknown.
-        decode: yields (frame number, picture) of some frames, given by their indices, or with
+        decode: yields (frame number, picture) of some frames, given by their numbers, or with
             None of all frames.
         tracks: tracks through all frames if new images are spread in parallax; else None.
         of_model: the existing images are those of a model, so `frame_list` may list more.

@@ -34,7 +34,7 @@ def image_names(pattern: str, frames: Sequence[int]) -> list[str]:
 
     Args:
         pattern: file name with one integer field, which takes the frame number, from 0.
-        frames: display indices.
+        frames: frame numbers.
 
     Raises:
         OptionError: the pattern has no integer field, or not the extension of an image.
