@@ -32,6 +32,7 @@ from colmap_av1 import (
     OptionError,
     PlaceOptions,
     VerifyOptions,
+    WriteError,
     map_database,
     match,
 )
@@ -281,7 +282,7 @@ def test_second_run_into_one_folder_fails_if_another_ends_first(
             is_waiting.clear()
             map_database(database, images, output)
 
-    with pytest.raises(ModelError, match="meanwhile"):
+    with pytest.raises(WriteError, match="meanwhile"):
         map_database(database, images, output, progress=map_meanwhile)
     models = [*tmp_path.iterdir()]
     assert [read_model(path / "0").num_reg_images() for path in models] == [NUM_IMAGES] * 2

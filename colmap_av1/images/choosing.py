@@ -146,7 +146,7 @@ def choose_frames(
             equally spaced.
 
     Returns:
-        int32 display indices, strictly ascending.
+        int32 frame numbers, strictly ascending.
 
     Raises:
         OptionError: `fps` needs times.
@@ -171,7 +171,7 @@ def spread_in_parallax(tracks: Tracks, num_images: int) -> NDArray[np.int32]:
         num_images: number of frames to choose.
 
     Returns:
-        int32 display indices, strictly ascending.
+        int32 frame numbers, strictly ascending.
     """
     return _evenly_spread(np.concatenate([[0.0], np.cumsum(parallax(tracks))]), num_images)
 

@@ -47,7 +47,7 @@ def frames_by_content(
         pictures: (frame number, uint8 [h, w, 3] BGR) of all frames, in order.
 
     Returns:
-        int32 [len(files)] display indices, all different.
+        int32 [len(files)] frame numbers, all different.
 
     Raises:
         ImageError: there are more images than frames, or an image cannot be read, or shows no
