@@ -158,7 +158,7 @@ def densify(
             "larger model, or a smaller --min_observations"
         )
     cameras = {i.camera_id: reconstruction.cameras[i.camera_id] for i in posed.values()}
-    inputs = _read_inputs(video, photos, options, posed).with_images_in(posed)
+    inputs = _read_inputs(video, photos, options, posed).keep_videos_of(posed)
     with unchanged(*inputs.states):
         sizes = {name: _size(cameras[image.camera_id]) for name, image in posed.items()}
         of_videos = images_of_videos(model, sizes, inputs, folder, options.match.images)

@@ -703,7 +703,7 @@ def _words_of(options: Options) -> list[str]:
 
 
 def _path_word(path: Path) -> str:
-    """The path as a shell word that programs do not take for an option or an address of SQLite."""
+    """The path as a shell word that programs take neither for an option nor for a URI."""
     return f"./{path}" if str(path).startswith(("-", "file:")) else str(path)
 
 

@@ -133,14 +133,15 @@ def run_batch(
     number, count = options.part
     shard = "" if options.shard is None else f"-{number}-of-{count}"
     start = time.perf_counter()
-    everything, num_repeated = list_videos([os.fspath(w) for w in words], place, options.stall)
+    # Before the output is opened, so that wrong inputs leave none.
+    listed, num_repeated = list_videos([os.fspath(word) for word in words], place, options.stall)
     with ExitStack() as opened:
         into = output_at(place)
         opened.enter_context(into.opened(shard))
         _refuse_another_task(into, place, work.task)
         _refuse_files_of_others(into, place, shard)
         _check_scratch(work.scratch)
-        videos = everything[number - 1 :: count]
+        videos = listed[number - 1 :: count]
         engine = (
             LocalEngine(work, options, len(videos))
             if options.engine == "local"
@@ -154,7 +155,7 @@ def run_batch(
             "task": work.task,
             "options": dataclasses.asdict(cast(Any, work.options)),
             "version": work.version,
-            "videos": len(everything),
+            "videos": len(listed),
         }
         rows: dict[int, Row] = {}
         earlier = _earlier_rows(into, shard, videos)

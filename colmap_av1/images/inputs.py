@@ -54,10 +54,11 @@ class Inputs:
         """The states of all files at the start."""
         return (*(video.state for video in self.videos), *(photo.state for photo in self.photos))
 
-    def with_images_in(self, names: Collection[str]) -> Inputs:
-        """Leave out videos of which a model has no image, with a warning.
+    def keep_videos_of(self, names: Collection[str]) -> Inputs:
+        """Keep the videos of which a model has images; a warning names the others.
 
-        A mapper makes separate models of videos that nothing connects.
+        If nothing connects the videos, a mapper makes a separate model of each. If the model has
+        images of none of them, all are kept.
 
         Args:
             names: names of the model's images.

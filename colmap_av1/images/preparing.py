@@ -160,8 +160,7 @@ def prepare_images(
             ImageChoice(options.images, existing, folder, display),
             masks=masks,
             one_size=folder is not None,
-            # Correcting the rolling shutter needs the motion between all neighbouring frames.
-            every_frame=options.camera.rolling_shutter != "none",
+            every_frame=options.camera.needs_every_frame,
             context=context,
         )
     if folder is not None:

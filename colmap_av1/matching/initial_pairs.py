@@ -155,7 +155,7 @@ def prepare_start(
             for number in range(1, len(known)):
                 own = search.of_model(number)
                 demote = own.bad_pairs_of_limits([limits, *limits.relaxed], demote, most)
-            # Where the mapper begins after its first model is not certain.
+            # With several models, the mapper may begin with another one than expected.
             is_tried = len(known) == 1 and not search.has_untried_pair
     return PreparedStart(with_demoted(matched, demote, most), limits, is_certain, is_tried)
 

@@ -66,6 +66,11 @@ class CameraOptions(Options):
         "global shutter",
     )
 
+    @property
+    def needs_every_frame(self) -> bool:
+        """Whether the motion of all frames is needed, to correct the rolling shutter."""
+        return self.rolling_shutter != "none"
+
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_shutter(self.rolling_shutter)

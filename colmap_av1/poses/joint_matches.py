@@ -67,7 +67,7 @@ _SIFT_CONTRAST = 0.02
 _SAME_POINT = 1.0
 # Two tracks of one video this close to each other, in pixels, are the same.
 _SAME_TRACK = 0.01
-# If a larger share of the images is not registered by a mapper, the estimate has failed.
+# If at least this share of the images is not registered, the estimate has failed.
 _MAX_LEFT = 0.5
 # Largest number of matches of the initial pair.
 _MAX_INITIAL_MATCHES = 300

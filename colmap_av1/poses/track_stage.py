@@ -126,7 +126,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
                 tracking,
                 ImageChoice(options.images, folder=partial),
                 masks=run.inputs.masks_of_videos[video],
-                every_frame=options.camera.rolling_shutter != "none",
+                every_frame=options.camera.needs_every_frame,
                 context=run.context,
             )
         chosen, tracked = found.chosen, found.video
@@ -195,11 +195,10 @@ def _track_long(run: Run, video: int, options: TrackingOptions, count: int) -> T
     candidates = np.array(evenly_spread(count, _CANDIDATES * run.options.max_images), np.int32)
     width, height = source.stream.picture_size
     held = len(candidates) * width * height / _PIXELS_PER_OBSERVATION
-    # Correcting the rolling shutter needs the motion between all neighbouring frames.
-    has_shutter = run.options.match.camera.rolling_shutter != "none"
+    every_frame = run.options.match.camera.needs_every_frame
     track = functools.partial(track_images, source, masks=run.inputs.masks_of_videos[video])
 
-    if options.refine.refine == "none" and not has_shutter and held <= _MAX_HELD:
+    if options.refine.refine == "none" and not every_frame and held <= _MAX_HELD:
 
         def choose(tracked: TrackedVideo) -> ChosenImages:
             few = tracked.tracks.every_nth(_FEWER)
@@ -220,7 +219,7 @@ def _track_long(run: Run, video: int, options: TrackingOptions, count: int) -> T
     return track(
         options,
         lambda _: chosen,
-        frames=None if has_shutter else chosen.frames,
+        frames=None if every_frame else chosen.frames,
         context=run.context,
     )
 

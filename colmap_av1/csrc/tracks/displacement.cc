@@ -1,11 +1,9 @@
 #include "tracks/displacement.h"
 
-#include <algorithm>
 #include <cmath>
 #include <limits>
 
 #include "av1/constants.h"
-#include "av1/spec_tables.h"
 #include "av1/warp.h"
 
 namespace colmap_av1::tracks {
