@@ -100,7 +100,7 @@ nb::tuple find_patches(const InputArray<std::uint8_t, nb::ndim<3>>& patches, con
                        const InputArray<float, nb::shape<-1, 2, 2>>& change, const Picture& target,
                        const Positions& start, float max_move) {
   if (patches.shape(1) != patches.shape(2)) {
-    throw nb::value_error("patches are not square");
+    throw nb::value_error("patches must be squares");
   }
   geometry::FoundPatches found;
   {
