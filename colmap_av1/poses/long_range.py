@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError
 from colmap_av1.geometry.colmap_model import ModelImage, posed_images
 from colmap_av1.geometry.coverage import PosedCamera
-from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.masks import Mask, make_mask
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file, natural_order
 from colmap_av1.matching.features.overlays import without_overlays
@@ -52,6 +53,9 @@ _MIN_MATCHES = 30
 _MIN_IN_VAIN = 3
 _SHARP_FEATURES = 200
 _SHARP_ANGLE = 15.0
+# Features of a model's image count up to this distance from the points that it observes, as a share
+# of its longer side. Matchers leave out dynamic objects, which therefore have no points.
+_POINT_DISTANCE = 0.03
 
 
 @dataclass(frozen=True)
@@ -235,9 +239,19 @@ def model_long_range_errors(
                 f"{image_file(image_path, image.name)}: is {size[0]}x{size[1]}, but its camera in "
                 f"the model {wanted[0]}x{wanted[1]}: give the folder of the model's images"
             )
-        check.add(index, picture)
+        seen = reconstruction.images[image.image_id].points2D
+        check.add(index, picture, _near_points([p.xy for p in seen if p.has_point3D()], size))
         progress("long range", done, len(check.wanted))
     return check.result()
+
+
+def _near_points(positions: Sequence[_Floats], size: tuple[int, int]) -> Mask:
+    """The pixels near the positions of points in an image of this (width, height)."""
+    kept = np.zeros(size[::-1], np.uint8)
+    radius = round(_POINT_DISTANCE * max(size))
+    for xy in positions:
+        cv2.circle(kept, np.round(xy).astype(int).tolist(), radius, 1, thickness=cv2.FILLED)
+    return make_mask(kept > 0)
 
 
 def _far_pairs(

@@ -61,6 +61,31 @@ def test_bent_model_is_reported(
     assert main([*whole, "--image_path", str(images)]) == 0
 
 
+def test_parts_without_points_do_not_count(made: ReconstructReport, tmp_path: Path) -> None:
+    model = read_model(made.output / "sparse" / "0")
+    texture = np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8)
+    moving = cv2.resize(texture, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
+    height, width = moving.shape[:2]
+    for k, image in enumerate(sorted(model.images.values(), key=lambda image: image.name)):
+        picture = cv2.imread(str(made.output / "images" / image.name))
+        left, top = 5 + 3 * k, 5 + k
+        picture[top : top + height, left : left + width] = moving[
+            : picture.shape[0] - top, : picture.shape[1] - left
+        ]
+        cv2.imwrite(str(tmp_path / image.name), picture)
+        hidden = [
+            number
+            for number, point in enumerate(image.points2D)
+            if point.has_point3D()
+            and (np.abs(point.xy - (left + width / 2, top + height / 2)) < (140, 110)).all()
+        ]
+        for number in hidden:
+            model.delete_observation(image.image_id, number)
+    found = model_long_range_errors(model, tmp_path)
+    assert found.median is not None
+    assert found.warning() is None
+
+
 def test_images_without_texture_are_reported(made: ReconstructReport, tmp_path: Path) -> None:
     for path in (made.output / "images").iterdir():
         blurred = cv2.blur(cv2.imread(str(path)), (61, 61))
