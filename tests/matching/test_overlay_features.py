@@ -72,6 +72,17 @@ def test_nothing_is_removed_if_everything_stays_or_moves() -> None:
         assert all(found[image] is features[image] for image in features)
 
 
+def test_a_camera_that_stands_still_for_a_while_keeps_its_features() -> None:
+    moving, is_over = views(12, 15.0, 40, seed=3)
+    # The camera stands still in the first four images.
+    features = {k: moving[0] if k < 12 else own for k, own in moving.items()}
+    found = without_overlays(features, [camera()] * 36)
+    for image, own in found.items():
+        kept = (features[image].xy[:, None] == own.xy[None]).all(axis=2).any(axis=1)
+        assert not kept[is_over].any()
+        assert kept[~is_over].mean() > 0.8
+
+
 def test_images_of_other_sizes_are_not_compared() -> None:
     features, _ = views(4, 15.0, 40, seed=2)
     cameras = [camera((320 + image, 240)) for image in range(12)]

@@ -19,6 +19,10 @@ _STILL = 1.0
 _LEAST_SHARE = 0.3
 # If the median share of all features is above this, the camera stands still and none is removed.
 _USUAL_SHARE = 0.25
+# The camera stands still between two images if more than this share of the features of one is fixed
+# in the other. These images are not compared. With noise, half of the features of a scene or more
+# are fixed; of an overlay, there are fewer.
+_SCENE_SHARE = 0.4
 # Side in pixels of the cells that overlays cover. Features at the edges of an overlay change with
 # the scene behind it, so whole cells are removed.
 _CELL = 16
@@ -84,7 +88,8 @@ def _shares_in_place(features: Sequence[Features], width: int) -> list[NDArray[n
         a = np.repeat(np.arange(len(wanted)) // len(around), count)
         b = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
         same = are_similar(own.descriptors[a], descriptors[b]) & (image[b] != k)
-        seen = np.unique(a[same] * num_images + image[b[same]]) // num_images
-        others = max(1, len(compared) - (k in compared))
-        shares.append(np.bincount(seen, minlength=len(own.xy)) / others)
+        seen, other = np.divmod(np.unique(a[same] * num_images + image[b[same]]), num_images)
+        still = np.bincount(other, minlength=num_images) > _SCENE_SHARE * len(own.xy)
+        others = max(1, sum(c != k and not still[c] for c in compared))
+        shares.append(np.bincount(seen[~still[other]], minlength=len(own.xy)) / others)
     return shares
