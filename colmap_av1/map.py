@@ -116,8 +116,8 @@ def map_database(
 
     Raises:
         DatabaseError: the database is missing, unreadable, or has no matches that a mapper can use.
-        ImageError: an image of the database is missing from the folder, or the first one differs in
-            size.
+        ImageError: an image of the database is missing from the folder, or the one that is examined
+            of each camera has another size.
         ModelError: the mapper fails or finds no model; the message names its log.
         WriteError: the output cannot be written.
         OptionError: the output is not empty and must not be replaced, or the database lacks an
@@ -221,16 +221,21 @@ def _map(
         copy_database(checked.database, copy)
         for forward in choices:
             models = Path(folder) / f"forward_{forward:d}"
-            num_registered = map_poses(
-                copy,
-                models,
-                replace(options, forward_motion=forward),
-                image_path=image_path,
-                log=log,
-                num_images=checked.num_images,
-                progress=progress,
-                effort="video",
-            )
+            try:
+                num_registered = map_poses(
+                    copy,
+                    models,
+                    replace(options, forward_motion=forward),
+                    image_path=image_path,
+                    log=log,
+                    num_images=checked.num_images,
+                    progress=progress,
+                    effort="video",
+                )
+            except ModelError:  # the other attempt may succeed
+                if forward == choices[-1] and not attempts:
+                    raise
+                continue
             shutil.copyfile(log, models / "mapper.log")
             attempts.append((num_registered, forward, models))
             if num_registered and 2 * num_registered[0] >= checked.num_connected_images:
@@ -339,10 +344,12 @@ def _check_input(database: Path, image_path: Path, place: PlaceOptions) -> Datab
                 f"scale: the database has no image '{other}': name images of it, such as "
                 f"{images[0].name}"
             )
-    size, wanted = image_size(files[0]), (images[0].width, images[0].height)
-    if size != wanted:
-        raise ImageError(
-            f"{files[0]}: is {'x'.join(map(str, size))}, but its camera in the database is "
-            f"{'x'.join(map(str, wanted))}: give the folder of the database's images"
-        )
+    of_cameras = {image.camera_id: (image, file) for image, file in zip(images, files, strict=True)}
+    for image, file in of_cameras.values():
+        size, wanted = image_size(file), (image.width, image.height)
+        if size != wanted:
+            raise ImageError(
+                f"{file}: is {'x'.join(map(str, size))}, but its camera in the database is "
+                f"{'x'.join(map(str, wanted))}: give the folder of the database's images"
+            )
     return checked

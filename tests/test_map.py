@@ -10,7 +10,9 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -140,6 +142,29 @@ def test_second_model_of_the_same_images_is_reported(
     assert any("again" in warning for warning in report.warnings)
 
 
+def test_one_of_two_attempts_may_fail(
+    database: Path,
+    images: Path,
+    made: ReconstructReport,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A small model leads to a second attempt with other initial pairs."""
+    mapped = copying(made.output / "sparse" / "0", 2)
+    for failing in (0, 1):
+        attempts = count()
+
+        def mapped_or_not(*args: Any, **kwargs: Any) -> tuple[int, ...]:
+            if next(attempts) == failing:  # noqa: B023 - called in the same iteration
+                raise ModelError("the mapper stopped with status -11")
+            return mapped(*args, **kwargs)
+
+        monkeypatch.setattr("colmap_av1.map.map_poses", mapped_or_not)
+        report = map_database(database, images, tmp_path / f"model_{failing}")
+        assert next(attempts) == 2
+        assert report.num_registered == (2,)
+
+
 def test_model_that_cannot_be_placed_keeps_the_coordinates_of_the_mapper(
     database: Path,
     images: Path,
@@ -244,6 +269,15 @@ def test_bad_databases_and_folders_are_reported(
         cv2.imwrite(str(tmp_path / "some" / path.name), np.zeros((8, 16, 3), np.uint8))
     with pytest.raises(ImageError, match="16x8"):
         map_database(database, tmp_path / "some", output)
+    # The last image has a camera of its own, of which only its image has another size.
+    several = tmp_path / "several.db"
+    shutil.copyfile(database, several)
+    with sqlite3.connect(several) as connection:
+        connection.execute("INSERT INTO cameras SELECT 9, model, 16, 8, params, 0 FROM cameras")
+        connection.execute("UPDATE images SET camera_id = 9 WHERE image_id = ?", (NUM_IMAGES,))
+    connection.close()
+    with pytest.raises(ImageError, match="16x8"):
+        map_database(several, images, output)
     typo = PlaceOptions(scale="2=frame_000000.png,typo.png")
     with pytest.raises(OptionError, match="typo"):
         map_database(database, tmp_path / "some", output, place=typo)
