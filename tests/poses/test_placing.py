@@ -261,3 +261,32 @@ def test_known_distance_overrides_the_scale_of_positions() -> None:
         # The centre of the path still comes from the positions.
         np.testing.assert_allclose(moved.mean(axis=0), 1.1 * centres.mean(axis=0), atol=1e-6)
         assert found.axes == "of the pose priors"
+
+
+@pytest.mark.parametrize("longitude", [0.0, 170.0, 180.0, -180.0])
+def test_positions_on_both_sides_of_the_date_line_place_a_model(longitude: float) -> None:
+    poses = walk()
+    images = images_of(transform_poses(elsewhere(), poses))
+    centres = camera_centres(poses) - camera_centres(poses).mean(axis=0)
+    metres = 111_319.49  # per degree on the equator
+    priors = {
+        image.name: PosePrior(
+            np.array([y / metres, (longitude + x / metres + 180) % 360 - 180, z]),
+            is_cartesian=False,
+        )
+        for image, (x, y, z) in zip(images, centres, strict=True)
+    }
+    found = find_placement(images, {1: CAMERA}, Surroundings(priors), PlaceOptions(), 0)
+    assert not found.warnings
+    assert found.units == "metres"
+    assert found.origin is not None
+    assert abs((found.origin.longitude - longitude + 180) % 360 - 180) < 1e-3
+    assert -180 <= found.origin.longitude < 180
+
+
+def test_a_single_position_is_kept_when_a_model_is_turned_upright() -> None:
+    images = images_of(transform_poses(elsewhere(), walk()))
+    known = Surroundings({}, place=(1.0, 2.0, 3.0))
+    found = find_placement(images, {1: CAMERA}, known, PlaceOptions(upright=True), 0)
+    assert found.axes == "z up"
+    assert any("single position" in how for how in found.how)

@@ -149,7 +149,7 @@ def find_placement(
     if options.upright and not found.is_moved:
         up, how = _up(poses, known)
         turned = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation_to_up(up)), np.zeros(3))
-        found = replace(found, similarity=turned, axes="z up", how=(f"z up by {how}",))
+        found = replace(found, similarity=turned, axes="z up", how=(*found.how, f"z up by {how}"))
     if options.scale is not None:
         found = _with_distance(found, images, cameras, options.scale)
     return found
@@ -172,8 +172,9 @@ def _by_positions(
     positions = np.array([prior.position for prior in priors if prior.is_cartesian == kind])
     origin: Origin | None = None
     if not kind:
+        positions[:, 1] = np.unwrap(positions[:, 1], period=360.0)
         latitude, longitude, altitude = np.median(positions, axis=0).tolist()
-        origin = Origin(latitude, longitude, altitude)
+        origin = Origin(latitude, (longitude + 180.0) % 360.0 - 180.0, altitude)
         positions = east_north_up(positions, (latitude, longitude, altitude))
     path = camera_centres(poses[at])
     gravity = known.gravity[at] if known.gravity is not None else None
