@@ -9,7 +9,7 @@ from colmap_av1.options.camera import DEFAULT_MODEL, camera_of_model, parse_came
 from colmap_av1.tracks.shutter import correct_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.run_context import RunContext
-from colmap_av1.video.display import Display
+from colmap_av1.video.display import UPRIGHT, Display
 
 
 def correct_rolling_shutter(
@@ -66,7 +66,7 @@ def rows_down(display: Display, size: tuple[int, int]) -> tuple[int, int]:
         size: (width, height) of the displayed pictures.
     """
     (_, across), (_, down) = display.turn
-    if display == Display() and size[0] < size[1]:
+    if display.turn == UPRIGHT and size[0] < size[1]:
         return (1, 0)
     return across, down
 
