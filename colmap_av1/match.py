@@ -522,9 +522,12 @@ def _match_images(
             raise ModelError("the database has several cameras for the images of one video")
         return _match_jointly(images, cameras, scratch, options, context)
     except (ModelError, VideoError) as error:
-        if options.verify.verify == "joint":
-            raise
+        # What follows the reason is advice for `reconstruct`, or names a log that is deleted.
         reason = str(error).rpartition(": ")[0] or str(error)
+        if options.verify.verify == "joint":
+            if isinstance(error, VideoError):
+                raise
+            raise ModelError(f"{reason}: leave out --verify joint") from error
     videos = [_with_selected_tracks(own, options, context) for own in images.videos]
     found = _match_pairs(replace(images, videos=videos), cameras, options, context)
     if not found.depth.is_observable:

@@ -58,7 +58,7 @@ def pinhole_camera(camera: pycolmap.Camera) -> pycolmap.Camera:
         low, high = _ZOOM_RANGE
         if not is_filled(high):
             raise ModelError(
-                f"camera {camera.model_name} {list(camera.params)} cannot be undistorted: give "
+                f"camera {camera.model_name} {camera.params.tolist()} cannot be undistorted: give "
                 "--camera_model and --camera_params, or --camera_model SIMPLE_PINHOLE, or keep the "
                 "distortion with --undistort 0"
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,6 +143,21 @@ def test_requested_joint_estimate_that_fails_is_an_error(scene: Path, tmp_path: 
     with pytest.raises((ModelError, VideoError)):
         match(tmp_path / "a.db", scene, options=options)
     assert not (tmp_path / "a.db").exists()
+
+
+def test_error_of_a_requested_joint_estimate_says_what_to_do(
+    joint: MatchReport, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The log that the mapper's message names is deleted with the other temporary files."""
+
+    def fail(*_: object, **__: object) -> None:
+        raise ModelError("the mapper stopped with status 3: see scratch/mapper.log")
+
+    monkeypatch.setattr(sys.modules[match.__module__], "match_jointly", fail)
+    options = replace(OPTIONS, verify=VerifyOptions(verify="joint"))
+    with pytest.raises(ModelError, match="--verify") as raised:
+        match(tmp_path / "a.db", scene, image_path=joint.image_path, options=options)
+    assert "log" not in str(raised.value)
 
 
 def test_matches_of_a_doubtful_joint_estimate_are_kept_with_a_warning(
