@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -280,7 +280,8 @@ def _run_stages(run: Run) -> ReconstructReport:
     further, not_registered = further_models(run, posed, image_set)
     assert posed.long_range is not None
     matches, poses, model = posed.matches.result, posed.last.result, written.result
-    implausible = focal_length_warning(read_posed_model(run.stages / poses.poses).cameras.values())
+    registered = read_posed_model(run.stages / poses.poses)
+    implausible = focal_length_warning(registered.cameras.values())
     long_range = posed.long_range.result
     return ReconstructReport(
         output=run.output,
@@ -293,7 +294,7 @@ def _run_stages(run: Run) -> ReconstructReport:
         dynamic_share=posed.dynamic.result.share if posed.dynamic is not None else None,
         num_key_images=len(matches.key_images),
         num_registered=poses.num_registered,
-        registered=poses.registered,
+        registered=_registered_by_video(registered.by_name, image_set),
         other_models=further,
         num_tracks=sum(stage.result.num_tracks for stage in tracked),
         num_pose_tracks=matches.num_pose_tracks,
@@ -326,10 +327,25 @@ def _run_stages(run: Run) -> ReconstructReport:
             *matches.warnings,
             *placed.result.place_warnings,
             *([implausible] if implausible is not None else []),
-            *_warnings(posed, model, len(image_set.sequence), further, not_registered),
+            *_warnings(posed, model, image_set, further, not_registered),
         ),
         timelines=_timelines(run, image_set, matches.key_images, not_registered),
     )
+
+
+def _registered_by_video(names: Container[str], image_set: ImageSet) -> dict[str, int]:
+    """Number of registered images of each video, by its name; empty for one video.
+
+    Args:
+        names: names of the registered images.
+        image_set: the images.
+    """
+    if len(image_set.videos) == 1:
+        return {}
+    return {
+        name: sum(image in names for image in image_set.of_video(video).names)
+        for video, name in enumerate(image_set.videos)
+    }
 
 
 def _timelines(
@@ -356,12 +372,13 @@ def _timelines(
 def _warnings(
     posed: Posed,
     model: ModelResult,
-    num_images: int,
+    image_set: ImageSet,
     further: Sequence[FurtherModel],
     not_registered: Sequence[str],
 ) -> list[str]:
     """Warnings about the poses and the model."""
     matches, poses = posed.matches.result, posed.last.result
+    num_images = len(image_set.sequence)
     warnings = []
     if further:
         warnings.append(
@@ -374,7 +391,11 @@ def _warnings(
             f"{len(not_registered)} of {num_images} images are not registered: "
             f"{some_names(not_registered)}"
         )
-    left_out = [name for name, count in poses.registered.items() if count == 0]
+    left_out = [
+        name
+        for video, name in enumerate(image_set.videos)
+        if set(image_set.of_video(video).names) <= set(not_registered)
+    ]
     if left_out and not further:
         names = ", ".join(f"'{name}'" for name in left_out)
         warnings.append(

@@ -67,7 +67,7 @@ def read_images(database: str | os.PathLike[str]) -> list[DatabaseImage]:
         The images; an empty list if the file is absent or empty.
 
     Raises:
-        DatabaseError: the file is being written, unreadable, or not a COLMAP database.
+        DatabaseError: the file is locked, unreadable, or not a COLMAP database.
     """
     path = Path(database)
     if is_new(path):
@@ -99,7 +99,7 @@ def read_cameras(database: str | os.PathLike[str]) -> dict[int, pycolmap.Camera]
     """Read the cameras of a database, by id.
 
     Raises:
-        DatabaseError: the file is being written, unreadable, or not a COLMAP database, or has a
+        DatabaseError: the file is locked, unreadable, or not a COLMAP database, or has a
             camera with invalid parameters or of a model that the installed pycolmap does not know.
     """
     path = Path(database)

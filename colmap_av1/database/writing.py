@@ -447,9 +447,9 @@ def _swap_images(geometry: TwoViewGeometry) -> TwoViewGeometry:
     """
     qvec = tvec = H = None
     if geometry.qvec is not None and geometry.tvec is not None:
-        w, x, y, z = geometry.qvec
-        qvec = np.array([w, -x, -y, -z])
-        tvec = -_rotation(qvec) @ geometry.tvec
+        rotation = pycolmap.Rotation3d(np.roll(geometry.qvec, -1))
+        inverse = pycolmap.Rigid3d(rotation, geometry.tvec).inverse()
+        qvec, tvec = np.roll(inverse.rotation.quat, 1), inverse.translation
     if geometry.H is not None and np.linalg.cond(geometry.H) < 1 / np.finfo(np.float64).eps:
         H = np.asarray(np.linalg.inv(geometry.H), dtype=np.float64)
     return dataclasses.replace(
@@ -460,13 +460,6 @@ def _swap_images(geometry: TwoViewGeometry) -> TwoViewGeometry:
         qvec=qvec,
         tvec=tvec,
     )
-
-
-def _rotation(qvec: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation matrix of a unit quaternion (w, x, y, z)."""
-    w, (x, y, z) = qvec[0], qvec[1:]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + 2 * w * cross + 2 * cross @ cross)
 
 
 def _complete_frames(connection: sqlite3.Connection, path: Path) -> None:

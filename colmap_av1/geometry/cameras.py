@@ -183,6 +183,12 @@ def check_pixel_aspect(camera: pycolmap.Camera, pixel_aspect: float, what_to_do:
     ]
 
 
+def largest_size(cameras: Iterable[pycolmap.Camera]) -> tuple[int, int]:
+    """Smallest (width, height) that holds the images of all cameras."""
+    sizes = [(int(camera.width), int(camera.height)) for camera in cameras]
+    return max(width for width, _ in sizes), max(height for _, height in sizes)
+
+
 def is_square(pixel_aspect: float) -> bool:
     """Whether pixels are square, up to rounding of the display size."""
     return abs(pixel_aspect - 1) < _SQUARE_TOLERANCE

@@ -89,6 +89,11 @@ class ModelPoints:
     image: NDArray[np.int64]
     xy: NDArray[np.float64]
 
+    @property
+    def point(self) -> NDArray[np.int64]:
+        """Index of the point of each observation: int64 [num_observations]."""
+        return np.repeat(np.arange(len(self.xyz)), np.diff(self.offsets))
+
 
 def joined_points(parts: Sequence[ModelPoints]) -> ModelPoints:
     """Concatenate sets of points that refer to the same images."""

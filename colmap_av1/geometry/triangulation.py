@@ -81,6 +81,11 @@ class TriangulatedPoints:
     num_agreeing: int
     num_tracks: int
 
+    @property
+    def point(self) -> NDArray[np.int64]:
+        """Index of the point of each observation: int64 [num_observations]."""
+        return np.repeat(np.arange(len(self.xyz)), np.diff(self.offsets))
+
 
 def triangulate(
     observations: Observations,

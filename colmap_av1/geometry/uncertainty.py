@@ -92,7 +92,7 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
         return np.full(num_images, np.inf)
     median = float(np.median(errors[np.isfinite(errors)]))
     kept = np.isfinite(errors) & (errors <= _OUTLIER * median)
-    point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))[kept]
+    point = points.point[kept]
     image = points.image[kept].astype(np.int64)
     # In units of the extent, and from the mean of the centres.
     rotation = np.array([own.cam_from_world[:, :3] for own in model.images])

@@ -119,7 +119,8 @@ def fast_frames(tracks: Tracks) -> NDArray[np.bool_]:
     """Find frames in which most tracks are short, because the camera turns or moves fast.
 
     Args:
-        tracks: all tracks of a video, not a selection.
+        tracks: all tracks of a video, or a random sample of them, with at least the first and the
+            last observation of each. Those selected for matching are longer than usual.
 
     Returns:
         bool [num_frames].

@@ -14,7 +14,13 @@ from colmap_av1.errors import VideoError
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.mapper_limits import INITIAL_MAX_FORWARD_MOTION, MIN_INLIERS
-from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches, schedule_pairs
+from colmap_av1.matching.pairs import (
+    ImageKeypoints,
+    image_keypoints,
+    next_track,
+    pair_matches,
+    schedule_pairs,
+)
 from colmap_av1.matching.two_view_geometry import UNUSED_CONFIGS, TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import PairOptions, VerifyOptions
@@ -128,9 +134,7 @@ def join_videos(videos: Sequence[PairedImages], image_set: ImageSet) -> PairedIm
             replace(k, frame=k.frame + first_frame, track=k.track + first_track)
             for k in own.keypoints
         ]
-        first_track += max(
-            (int(k.track.max()) + 1 for k in own.keypoints if k.track.size), default=0
-        )
+        first_track += next_track(own.keypoints)
     no_xy, no_track = np.empty((0, 2), np.float32), np.empty(0, np.int64)
     photos = image_set.images.frames[len(keypoints) :]
     keypoints += [ImageKeypoints(int(frame), no_xy, no_track) for frame in photos]

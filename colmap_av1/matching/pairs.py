@@ -39,6 +39,11 @@ class ImageKeypoints:
     track: NDArray[np.int64]
 
 
+def next_track(keypoints: Sequence[ImageKeypoints]) -> int:
+    """The first number that is higher than those of all tracks."""
+    return max((int(own.track.max()) + 1 for own in keypoints if own.track.size), default=0)
+
+
 def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoints]:
     """Collect the track observations of the frames that become images.
 

@@ -25,7 +25,6 @@ from colmap_av1.poses.posed_images import (
     PosesResult,
     check_agreement,
     read_posed_images,
-    registered_by_video,
     triangulate_in,
 )
 from colmap_av1.poses.run import Run
@@ -152,7 +151,6 @@ def adjustment_stage(
         return AdjustedResult(
             poses=f"adjusted{suffix}.npz",
             num_registered=len(result.images),
-            registered=registered_by_video(result.by_name, image_set),
             num_motion_points=int(is_motion.sum()),
             doubtful_seams=tuple(seams.pairs[i] for i in seams.doubtful),
             few_point_seams=tuple(seams.pairs[i] for i in seams.few_points),

@@ -428,7 +428,7 @@ def _pose_images(
     """
     mapped = found.models
     if first is not None:
-        mapped = with_model_first(run, mapped, found.keyed, first)
+        mapped = with_model_first(run, mapped, first)
     # Without a read-out time the tracks were not corrected.
     has_picture_positions = not any(own.read_out for own in videos)
     trusted = trusted_tracks(run, [own.tracks for own in videos], image_set)

@@ -215,7 +215,7 @@ def _poses_of_model(
         model = mapped.model
         cameras = {i: known.get(i, camera) for i, camera in model.cameras.items()}
         write_posed_model(partial / "mapped.npz", PosedModel(cameras, model.images))
-        return MappedResult("mapped.npz", len(model.images), {}, first.mapped.result.mapper, ())
+        return MappedResult("mapped.npz", len(model.images), first.mapped.result.mapper, ())
 
     return run_stage(
         own.stages,

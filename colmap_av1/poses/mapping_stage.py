@@ -23,7 +23,7 @@ from colmap_av1.options import MapOptions
 from colmap_av1.poses.adjusting import refines_intrinsics, with_second_distortion
 from colmap_av1.poses.mapper import MapperEffort, map_poses
 from colmap_av1.poses.match_stage import MatchesResult
-from colmap_av1.poses.posed_images import PosesResult, registered_by_video
+from colmap_av1.poses.posed_images import PosesResult
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.start_tracks import keep_start_tracks
 from colmap_av1.poses.track_stage import LEAST_IMAGES
@@ -116,7 +116,8 @@ def mapping_stage(
                     break
         if not found:
             raise ModelError(_why_no_initial_pair(found_before, attempt.mapper))
-        found = _largest_first(found, image_set, keyed)
+        # Further images belong to the model of their nearest key image.
+        found.sort(key=lambda model: -num_nearest(model, image_set, keyed))
         (partial / "poses").mkdir()
         files = [f"poses/{number}.npz" for number in range(len(found))]
         for file, model in zip(files, found, strict=True):
@@ -124,7 +125,6 @@ def mapping_stage(
         return MappedResult(
             poses=files[0],
             num_registered=len(found[0].images),
-            registered=registered_by_video(found[0].by_name, keyed),
             mapper=attempt.mapper,
             other_models=tuple(files[1:]),
         )
@@ -144,13 +144,6 @@ def mapping_stage(
     )
 
 
-def _largest_first(
-    models: list[PosedModel], image_set: ImageSet, keyed: ImageSet
-) -> list[PosedModel]:
-    """Sort models by the number of images whose nearest key image they have."""
-    return sorted(models, key=lambda model: -num_nearest(model, image_set, keyed))
-
-
 def num_nearest(model: PosedModel, image_set: ImageSet, keyed: ImageSet) -> int:
     """The number of images whose nearest key image is in a model.
 
@@ -165,24 +158,20 @@ def num_nearest(model: PosedModel, image_set: ImageSet, keyed: ImageSet) -> int:
     return int(np.count_nonzero(is_in_model[nearest]))
 
 
-def with_model_first(
-    run: Run, mapped: Kept[MappedResult], keyed: ImageSet, file: str
-) -> Kept[MappedResult]:
+def with_model_first(run: Run, mapped: Kept[MappedResult], file: str) -> Kept[MappedResult]:
     """The models of the mapper, with another one as the first.
 
     Args:
         run: the run.
         mapped: the models, see `mapping_stage`.
-        keyed: the key images.
         file: the file of the new first model.
     """
-    placed = read_posed_model(run.stages / file).by_name
+    num_registered = len(read_posed_model(run.stages / file).images)
     others = [own for own in (mapped.result.poses, *mapped.result.other_models) if own != file]
     result = replace(
         mapped.result,
         poses=file,
-        num_registered=len(placed),
-        registered=registered_by_video(placed, keyed),
+        num_registered=num_registered,
         other_models=tuple(others),
     )
     return replace(mapped, result=result, digest=digest_of([mapped.digest, file]))

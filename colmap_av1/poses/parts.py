@@ -31,7 +31,6 @@ from colmap_av1.geometry.uncertainty import MAX_CERTAIN_ERROR, MAX_IMAGES, centr
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.mapping_stage import MappedResult
-from colmap_av1.poses.posed_images import registered_by_video
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.seams import least_depth_angle, ray_angle
 from colmap_av1.util.graphs import connected_components
@@ -83,7 +82,7 @@ def split_stage(
         return parts_of(known, image_set, seams, rival=other)
 
     key = [list(seams), rival.digest if rival is not None else None]
-    return _parts_stage(run, image_set, mapped, adjusted, parts, name=f"parts_{number}", key=key)
+    return _parts_stage(run, mapped, adjusted, parts, name=f"parts_{number}", key=key)
 
 
 def certain_stage(
@@ -102,12 +101,11 @@ def certain_stage(
     def parts(known: PosedModel) -> list[AbstractSet[str]]:
         return certain_parts(known, image_set)
 
-    return _parts_stage(run, image_set, mapped, adjusted, parts, name=f"certain_{number}")
+    return _parts_stage(run, mapped, adjusted, parts, name=f"certain_{number}")
 
 
 def _parts_stage(
     run: Run,
-    image_set: ImageSet,
     mapped: Kept[MappedResult],
     adjusted: Kept[AdjustedResult],
     parts_of_model: Callable[[PosedModel], list[AbstractSet[str]]],
@@ -118,8 +116,7 @@ def _parts_stage(
     """Write the parts of an adjusted model, see `split_stage`.
 
     Args:
-        run: the run, as the next three.
-        image_set: see `split_stage`.
+        run: see `split_stage`.
         mapped: see there.
         adjusted: see there.
         parts_of_model: returns the names of the images of each part.
@@ -138,7 +135,6 @@ def _parts_stage(
         return MappedResult(
             poses=files[0],
             num_registered=len(parts[0]),
-            registered=registered_by_video(parts[0], image_set),
             mapper=mapped.result.mapper,
             other_models=(*files[1:], *mapped.result.other_models),
         )
@@ -276,7 +272,7 @@ def _seen_in_stretches(
         alone give the point depth, bool [n].
     """
     points = model.points
-    point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
+    point = points.point
     num_stretches = int(of_image.max()) + 1
     pair, first, visit = np.unique(
         point * num_stretches + of_image[points.image], return_index=True, return_inverse=True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,12 +36,10 @@ class PosesResult:
     Attributes:
         poses: file of the posed model, in the folder of the stages.
         num_registered: number of registered images.
-        registered: number of registered images of each video, by its name; empty for one video.
     """
 
     poses: str
     num_registered: int
-    registered: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -126,18 +124,3 @@ def check_agreement(num_points: int, num_tracks: int) -> None:
             f"none of the {num_tracks} tracks agrees with the poses: try the other --mapper, or "
             "give --camera_params"
         )
-
-
-def registered_by_video(names: Container[str], image_set: ImageSet) -> dict[str, int]:
-    """Number of registered images of each video, by its name; empty for one video.
-
-    Args:
-        names: names of the registered images.
-        image_set: the images.
-    """
-    if len(image_set.videos) == 1:
-        return {}
-    return {
-        name: sum(image in names for image in image_set.of_video(video).names)
-        for video, name in enumerate(image_set.videos)
-    }

@@ -46,7 +46,6 @@ from colmap_av1.poses.mapping_stage import MappedResult
 from colmap_av1.poses.posed_images import (
     FROM_PICTURES,
     posed_images_of,
-    registered_by_video,
     triangulate_in,
 )
 from colmap_av1.poses.run import Run
@@ -145,7 +144,6 @@ def remap_stage(
         return RemappedResult(
             poses=files[0],
             num_registered=len(poses.images),
-            registered=registered_by_video(placed, image_set),
             mapper="global",
             other_models=(*files[1:], *mapped.result.other_models),
             share=len(poses.images) / len(known.images),

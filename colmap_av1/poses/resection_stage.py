@@ -18,7 +18,6 @@ from colmap_av1.poses.posed_images import (
     PosesResult,
     check_agreement,
     read_posed_images,
-    registered_by_video,
     triangulate_in,
 )
 from colmap_av1.poses.run import Run
@@ -46,7 +45,7 @@ def resection_stage(
             placed = _resect(run, tracks, image_set, known)
         model = PosedModel(known.cameras, placed)
         write_posed_model(partial / "placed.npz", model)
-        return PosesResult("placed.npz", len(placed), registered_by_video(model.by_name, image_set))
+        return PosesResult("placed.npz", len(placed))
 
     return run_stage(
         run.stages,

@@ -311,7 +311,7 @@ def _seen_points(
     index = {image.name: k for k, image in enumerate(images)}
     image = np.array([index[image.name] for image in model.images], np.int64)
     points = model.points
-    point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
+    point = points.point
     # A point may have several observations in an image.
     views = np.unique(np.column_stack([point, image[points.image]]), axis=0)
     enough = np.bincount(views[:, 0], minlength=len(points.xyz)) >= _FEWEST_VIEWS

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.geometry.cameras import largest_size
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.geometry.track_points import tracks_of_points
 from colmap_av1.images.image_set import ImageSet
@@ -21,8 +22,7 @@ def tracks_of_model(model: PosedModel, image_set: ImageSet) -> Tracks:
     """The observations of a model's points as tracks through the frames of its images."""
     frame_of = image_set.images.frame_of
     frames = np.array([frame_of[image.name] for image in model.images], np.int32)
-    cameras = model.cameras.values()
-    size = max(int(c.width) for c in cameras), max(int(c.height) for c in cameras)
+    size = largest_size(model.cameras.values())
     return tracks_of_points(model.points, frames, image_set.num_frames, size)
 
 

@@ -144,7 +144,7 @@ class Sweep:
 
 def _nearest_observed(points: ModelPoints, views: Sequence[PosedCamera]) -> list[_Floats]:
     """Depth of the nearest observed point in each cell of each image; inf without one."""
-    owner = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
+    owner = points.point
     by_image, bounds = grouped(points.image, len(views))
     grids = []
     for image, view in enumerate(views):

@@ -144,7 +144,7 @@ def test_links_join_images_across_a_gap_in_the_tracks(
         tracks,
         links,
         image_set,
-        Kept(PosesResult("placed.npz", NUM_IMAGES, {}), "", resumed=False),
+        Kept(PosesResult("placed.npz", NUM_IMAGES), "", resumed=False),
         dynamic_masks={},
         masked=None,
         has_picture_positions=True,

@@ -81,7 +81,7 @@ def test_second_mapping_is_used_if_it_fits_at_least_as_well() -> None:
         kept: float, new_cost: float, *, share: float = 1.0, from_initial: bool = False
     ) -> RemappedResult:
         return RemappedResult(
-            "", 3, {}, "global", (), share, kept, 1.0, new_cost, from_initial=from_initial
+            "", 3, "global", (), share, kept, 1.0, new_cost, from_initial=from_initial
         )
 
     assert result(kept=0.97, new_cost=0.8).fits(0.9)

@@ -19,6 +19,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
+from colmap_av1.geometry.cameras import largest_size
 from colmap_av1.images.image_set import ImageSet, Pictures
 from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.sift import Features
@@ -155,7 +156,7 @@ def link_images(
     if plan.wanted:
         linked = link(plan)
     else:
-        nothing = Tracks.empty(image_set.num_frames, _largest_size(cameras))
+        nothing = Tracks.empty(image_set.num_frames, largest_size(cameras))
         linked = LinkedImages(matched, nothing, with_parts(LinkReport(), matched, image_set))
     if linked.report.frames_of_gaps("no overlap" if plan.loop else "few tracks"):
         # The scene on either side of a cut may reappear anywhere in the videos.
@@ -243,11 +244,6 @@ def _link(
         same_videos=same_videos(links, features, cameras, image_set),
     )
     tracks = links_as_tracks(
-        links, features, image_set.images.frames, image_set.num_frames, _largest_size(cameras)
+        links, features, image_set.images.frames, image_set.num_frames, largest_size(cameras)
     )
     return LinkedImages(merged, tracks, with_parts(report, merged, image_set))
-
-
-def _largest_size(cameras: Sequence[pycolmap.Camera]) -> tuple[int, int]:
-    """Smallest (width, height) that holds the pictures of all cameras."""
-    return max(int(c.width) for c in cameras), max(int(c.height) for c in cameras)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from colmap_av1.matching.features.sift import Features
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.links.matching import Links
-from colmap_av1.matching.pairs import ImageKeypoints
+from colmap_av1.matching.pairs import ImageKeypoints, next_track
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.graphs import connected_components
@@ -33,7 +33,7 @@ def merge_links(
     for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True):
         used.setdefault(i, set()).update(geometry.inlier_matches[:, 0].tolist())
         used.setdefault(j, set()).update(geometry.inlier_matches[:, 1].tolist())
-    num_tracks = max((int(k.track.max()) + 1 for k in matched.keypoints if k.track.size), default=0)
+    num_tracks = next_track(matched.keypoints)
     keypoints = list(matched.keypoints)
     place: dict[int, NDArray[np.int64]] = {}
     for image, indices in used.items():

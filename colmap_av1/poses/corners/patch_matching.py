@@ -107,7 +107,7 @@ def match_patches(
         the patch is cut, and the matches in other images. Images with few matches keep the
         followed corners.
     """
-    point = np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
+    point = points.point
     image, xy = view[points.observation], corners.xy[points.observation].astype(np.float64)
     middle = (points.offsets[:-1] + points.offsets[1:]) // 2
     by_image, bounds = grouped(image, len(views))
@@ -170,7 +170,7 @@ def _cut(
         views: all images.
         pictures: their pictures.
     """
-    xyz, point = points.xyz, np.repeat(np.arange(len(points.xyz)), np.diff(points.offsets))
+    xyz, point = points.xyz, points.point
     grey = np.empty((len(xyz), _PATCH, _PATCH), np.uint8)
     fraction, ray = np.empty((len(xyz), 2)), np.empty((len(xyz), 3))
     surface = np.empty((len(xyz), 3, 3))

@@ -140,8 +140,8 @@ def place_tracks(
         own = own[np.isfinite(xyz[track[own], 0])]
         pose = view.cam_from_world
         local = xyz[track[own]] @ pose[:, :3].T + pose[:, 3]
-        before = local[:, 2] > 0
-        own, local = own[before], local[before]
+        ahead = local[:, 2] > 0
+        own, local = own[ahead], local[ahead]
         seen = np.asarray(view.camera.img_from_cam(local)).reshape(-1, 2)
         error[own] = np.linalg.norm(seen - tracks.xy[own], axis=1)
         depth[own] = local[:, 2]
@@ -278,12 +278,14 @@ class Contradictions:
             count = uniform_filter(counts.reshape(rows, columns), _AROUND, mode="constant")
             count *= _AROUND**2
             enough = count[shown.row, shown.column] > _MIN_POINTS_BEHIND - 0.5
-            before = shown.depth * _HIDES < nearest[shown.row, shown.column]
-            return shown.track[enough], before[enough]
+            is_nearer = shown.depth * _HIDES < nearest[shown.row, shown.column]
+            return shown.track[enough], is_nearer[enough]
 
-        for track, before in map_on_threads(hiding_in, range(len(self._seen)), self._num_threads):
+        for track, is_nearer in map_on_threads(
+            hiding_in, range(len(self._seen)), self._num_threads
+        ):
             looked[track] += 1
-            hides[track] += before
+            hides[track] += is_nearer
         return (hides > _HIDDEN_SHARE * looked) & (looked >= _MIN_IMAGES)
 
     def _seen_through(self, agreeing: _Bools) -> _Bools:

@@ -130,7 +130,7 @@ def expect_in_views(
         projections.
     """
     num_points = len(points.xyz)
-    point = np.repeat(np.arange(num_points), np.diff(points.offsets))
+    point = points.point
     seen_by = view[points.observation]
     first, last = seen_by[points.offsets[:-1]], seen_by[points.offsets[1:] - 1]
     by_view, bounds = grouped(seen_by, len(views))

@@ -76,7 +76,6 @@ def place_stage(
         return PlaceResult(
             poses=Path(file).name,
             num_registered=posed.result.num_registered,
-            registered=posed.result.registered,
             place=found.place,
             place_warnings=tuple(found.warnings),
         )
