@@ -225,45 +225,46 @@ class VideoStream:
             last = packet
             yield Packet(memoryview(packet).toreadonly(), pts, index)
             index += 1
-        damage = self._missing_end(index, last)
+        damage = missing_end(self.file, index, last)
         if damage:
             raise BitstreamError(f"{self.file}: {damage}")
         if index == 0:
             raise VideoError(f"{self.file}: has no frames: give another video")
 
-    def _missing_end(self, count: int, last: Any) -> str | None:
-        """Describe how a file is cut off that the demuxer treats as complete; None if it is whole.
 
-        Args:
-            count: number of packets read.
-            last: the last packet, of PyAV.
-        """
-        file = self.file
-        if 0 < count < (file.num_packets or 0) and "mp4" in file.container:
-            return f"cut off after {count} of {file.num_packets} packets"
-        if count == 0:
-            # The sample tables point outside the file, or it ends inside the first packet.
-            if file.num_packets or (file.duration and "matroska" in file.container):
-                return "damaged or cut off before the end of the first packet"
-            return None
-        size = self._container.size
-        if last.pos is not None and last.pos >= 0 and size > 0:
-            end = last.pos + last.size
-            if file.container == "ivf" and end + _IVF_FRAME_HEADER_SIZE != size:
-                return f"cut off after packet {count}"
-            if file.container == "obu" and end != size:
-                return f"cut off after packet {count}"
-            if "matroska" in file.container and is_matroska_cut(file.path, last.pos):
-                return f"cut off after packet {count}"
-        if "mp4" in file.container and is_fragmented_mp4_cut(file.path):
-            return f"cut off after packet {count}"
-        if "matroska" in file.container and file.duration and last.pts is not None:
-            step = 1 / file.frame_rate if file.frame_rate else 0.0
-            length = float((last.duration or 0) * last.time_base)
-            end_time = float(last.pts * last.time_base) + max(length, step)
-            if end_time + 1.5 * step < file.duration:
-                return f"cut off after {end_time:.2f} of {file.duration:.2f} seconds"
+def missing_end(file: VideoFile, count: int, last: Any) -> str | None:
+    """Describe how a file is cut off that the demuxer treats as complete; None if it is whole.
+
+    Args:
+        file: the file.
+        count: number of packets of its video stream.
+        last: the last packet, of PyAV; None without packets.
+    """
+    if 0 < count < (file.num_packets or 0) and "mp4" in file.container:
+        return f"cut off after {count} of {file.num_packets} packets"
+    if count == 0:
+        # The sample tables point outside the file, or it ends inside the first packet.
+        if file.num_packets or (file.duration and "matroska" in file.container):
+            return "damaged or cut off before the end of the first packet"
         return None
+    size = file.path.stat().st_size
+    if last.pos is not None and last.pos >= 0:
+        end = last.pos + last.size
+        if file.container == "ivf" and end + _IVF_FRAME_HEADER_SIZE != size:
+            return f"cut off after packet {count}"
+        if file.container == "obu" and end != size:
+            return f"cut off after packet {count}"
+        if "matroska" in file.container and is_matroska_cut(file.path, last.pos):
+            return f"cut off after packet {count}"
+    if "mp4" in file.container and is_fragmented_mp4_cut(file.path):
+        return f"cut off after packet {count}"
+    if "matroska" in file.container and file.duration and last.pts is not None:
+        step = 1 / file.frame_rate if file.frame_rate else 0.0
+        length = float((last.duration or 0) * last.time_base)
+        end_time = float(last.pts * last.time_base) + max(length, step)
+        if end_time + 1.5 * step < file.duration:
+            return f"cut off after {end_time:.2f} of {file.duration:.2f} seconds"
+    return None
 
 
 def check_process(video: str | os.PathLike[str], process: int) -> None:

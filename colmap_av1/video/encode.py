@@ -40,7 +40,7 @@ from colmap_av1.video.encoders import (
     reason_in_log,
     settings,
 )
-from colmap_av1.video.facts import Video, read_video, with_counted_packets
+from colmap_av1.video.facts import Video, cut_off, read_video, with_counted_packets
 from colmap_av1.video.metadata.positions import read_positions
 from colmap_av1.video.metadata.telemetry import carrying, loss_of
 from colmap_av1.video.stored_frames import count_decodable
@@ -181,6 +181,9 @@ def _encode(
         mark["downscale"] = float(options.downscale or 1)
     if is_kept:
         mark["source"] = _source(path)
+    damage = cut_off(file)
+    if damage is not None:
+        mark["readable"] = file.num_packets
 
     def convert(partial: Path, num_frames: int | None = None) -> int:
         total = num_frames or file.num_packets
@@ -201,7 +204,7 @@ def _encode(
     try:
         with whole_file(target) as partial, unchanged(file.state):
             count = convert(partial)
-            readable = _readable_frames(file, count, strict)
+            readable = _readable_frames(file, count, damage, strict=strict)
             if readable < count:
                 count = convert(partial, readable)
     except OSError as error:
@@ -350,14 +353,20 @@ def _process(command: Sequence[str], log_file: object) -> Iterator[subprocess.Po
                 process.stdout.close()
 
 
-def _readable_frames(video: VideoFile, count: int, strict: bool) -> int:
+def _readable_frames(video: VideoFile, count: int, damage: str | None, *, strict: bool) -> int:
     """Number of the `count` frames written by ffmpeg that PyAV decodes, too.
 
     ffmpeg continues after damage, and the frames that it skips shift all later ones.
+
+    Args:
+        video: the video.
+        count: number of frames that ffmpeg wrote.
+        damage: how the file is cut off, see `cut_off`.
+        strict: whether damage is an error.
     """
-    if count == video.num_packets:
-        return count
-    readable, damage = count_decodable(video)
+    readable = count
+    if count != video.num_packets:
+        readable, damage = count_decodable(video)
     if damage is None and readable == count:
         return count
     if damage is None or readable > count:
@@ -374,9 +383,10 @@ def _readable_frames(video: VideoFile, count: int, strict: bool) -> int:
 
 
 def _warn_of_damage(video: VideoFile, readable: int, reason: str) -> None:
+    missing = readable < (video.num_packets or 0)
+    of_all = f" of {video.num_packets}" if missing else ""
     warnings.warn(
-        f"{video}: damaged after {readable} of {video.num_packets} frames, only these are used: "
-        f"{reason}",
+        f"{video}: damaged after {readable}{of_all} frames, only these are used: {reason}",
         stacklevel=3,
     )
 

@@ -23,6 +23,7 @@ from colmap_av1.video.container import (
     VideoFile,
     describe,
     find_decodable_stream,
+    missing_end,
     open_container,
     until_damage,
 )
@@ -188,6 +189,18 @@ def _packets_before_damage(file: VideoFile) -> Iterator[Any]:
         for packet in container.demux(container.streams[file.index]):
             if packet.size:  # PyAV marks the end with an empty packet
                 yield packet
+
+
+def cut_off(file: VideoFile) -> str | None:
+    """Describe how a file is cut off that FFmpeg treats as complete; None if it is whole.
+
+    Raises:
+        VideoError: as `decode_frames`.
+    """
+    count, last = 0, None
+    for packet in _packets_before_damage(file):
+        count, last = count + 1, packet
+    return missing_end(file, count, last)
 
 
 def with_counted_packets(file: _File) -> _File:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -381,6 +382,25 @@ def test_damaged_video_is_used_up_to_the_damage(
     assert [line.split(":")[1] for line in lines] == [" error", " warning"]
     assert first.output.read_bytes() == bytes_before
     assert not list(tmp_path.glob(".*"))
+
+
+def test_video_whose_end_is_missing_is_used_with_a_warning(
+    phone: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    whole = ffmpeg("-i", phone, "-c", "copy", tmp_path / "whole.mkv")
+    video = tmp_path / "cut.mkv"
+    video.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    stream = tmp_path / "kept.mp4"
+    for _ in range(2):  # the stream is reused the second time
+        with pytest.warns(UserWarning, match="damaged"):
+            report = stream_of(video, stream)
+        assert 0 < report.num_frames < len(times(phone))
+    with pytest.raises(BitstreamError, match="cut off"):
+        encode_video(video, tmp_path / "strict.mp4", strict=True)
+    assert not (tmp_path / "strict.mp4").exists()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        encode_video(whole, tmp_path / "whole.mp4", strict=True)
 
 
 def test_frames_are_counted_if_the_container_does_not_store_their_number(
