@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import warnings
 from collections import Counter
@@ -36,6 +35,9 @@ _Image = NDArray[np.uint8]
 # are numbered as players show them, from 0.
 _Decode = Callable[[Collection[int] | None], Iterable[tuple[int, _Image]]]
 
+# Added to times in ticks, which are rational numbers. At half the frame rate of a video, every
+# other time lies halfway between two ticks.
+_ROUNDING = 1e-6
 # Longer side in pixels at which sharpness is measured.
 _SHARPNESS_SIZE = 640
 # A frame is blurred if its sharpness is less than this share of the sharpest frame nearby.
@@ -385,29 +387,16 @@ def _by_content(
     files: Sequence[Path],
     decode: _Decode,
 ) -> ChosenImages:
-    """Find the frames of images by content, without images that repeat the previous one.
-
-    FFmpeg's fps filter repeats pictures if the video has a lower rate.
-    """
-    try:
-        return _in_order(names, frames_by_content(files, decode(None)))
-    except ImageError:
-        pairs = enumerate(itertools.pairwise(files), start=1)
-        repeated = [k for k, (before, file) in pairs if _are_same_bytes(before, file)]
-        if not repeated or len(files) - len(repeated) < 2:
-            raise
-    once = sorted(set(range(len(files))) - set(repeated))
-    frames = frames_by_content([files[k] for k in once], decode(None))
-    warnings.warn(
-        f"{files[0].parent}: ignored {len(repeated)} images that repeat the previous one, the "
-        f"first is '{names[repeated[0]]}'",
-        stacklevel=2,
-    )
-    return _in_order([names[k] for k in once], frames)
-
-
-def _are_same_bytes(file: Path, other: Path) -> bool:
-    return file.stat().st_size == other.stat().st_size and file.read_bytes() == other.read_bytes()
+    """Find the frames of images by content, without images that repeat the previous one."""
+    kept, frames = frames_by_content(files, decode(None))
+    repeated = sorted(set(range(len(files))) - set(kept))
+    if repeated:
+        warnings.warn(
+            f"{files[0].parent}: ignored {len(repeated)} images that repeat the previous one, the "
+            f"first is '{names[repeated[0]]}'",
+            stacklevel=2,
+        )
+    return _in_order([names[k] for k in kept], frames)
 
 
 def _in_order(names: Sequence[str], frames: NDArray[np.int32]) -> ChosenImages:
@@ -451,9 +440,10 @@ def _sharpness(pictures: Iterable[tuple[int, _Image]]) -> NDArray[np.float64]:
 
 def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:
     """The frames that FFmpeg's fps filter selects: for each tick, the last that rounds to it."""
-    tick = np.floor(times * fps + 0.5)
+    half = 0.5 + _ROUNDING
+    tick = np.floor(times * fps + half)
     interval = np.median(np.diff(times)) if len(times) > 1 else 0.0
-    num_ticks = max(1.0, np.floor((times[-1] + interval) * fps + 0.5))
+    num_ticks = max(1.0, np.floor((times[-1] + interval) * fps + half))
     is_last = np.append(tick[1:] > tick[:-1], True)
     return np.flatnonzero(is_last & (tick < num_ticks)).astype(np.int32)
 

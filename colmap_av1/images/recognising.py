@@ -35,19 +35,22 @@ _SAME = 5e-5
 
 def frames_by_content(
     files: Sequence[Path], pictures: Iterable[tuple[int, _Image]]
-) -> NDArray[np.int32]:
+) -> tuple[list[int], NDArray[np.int32]]:
     """Find the frames that image files show.
 
     The frame of an image is the most similar one. If several are, because the camera stands still,
     the files are assumed to be in the order of the video. The result must be unambiguous: each
-    image is similar to its frame, and clearly less similar to all other frames.
+    image is similar to its frame, and clearly less similar to all other frames. If it is not,
+    images that show the same frame as the one before are left out: FFmpeg repeats pictures if the
+    video has a lower or a varying rate.
 
     Args:
         files: image files of any size with the video's aspect ratio.
         pictures: (frame number, uint8 [h, w, 3] BGR) of all frames, in order.
 
     Returns:
-        int32 [len(files)] frame numbers, all different.
+        Indices of the images that are not left out, ascending, and int32 [n] their frame numbers,
+        all different.
 
     Raises:
         ImageError: there are more images than frames, or an image cannot be read, or shows no
@@ -55,6 +58,20 @@ def frames_by_content(
     """
     images = np.array([_thumbnail(read_image(path)) for path in files])
     frames = np.array([_thumbnail(picture) for _, picture in pictures])
+    try:
+        return list(range(len(files))), _assigned(files, images, frames)
+    except ImageError:
+        nearest = np.argmax(images @ frames.T, axis=1)
+        kept = np.flatnonzero(np.append(True, nearest[1:] != nearest[:-1])).tolist()
+        if not 2 <= len(kept) < len(files):
+            raise
+    return kept, _assigned([files[k] for k in kept], images[kept], frames)
+
+
+def _assigned(
+    files: Sequence[Path], images: NDArray[np.float32], frames: NDArray[np.float32]
+) -> NDArray[np.int32]:
+    """The frames of images by the thumbnails of both, see `frames_by_content`."""
     if len(images) > len(frames):
         raise ImageError(
             f"there are {len(images)} images, but the video has {len(frames)} frames: "
