@@ -718,7 +718,8 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
     if filled is not None and options.on_existing == "error":
         raise DatabaseError(
             f"{database}: image '{filled.name}' already has {filled.num_keypoints} keypoints and "
-            f"{filled.num_matches} matches: --on_existing append adds to them, replace removes them"
+            f"{filled.num_matches} matches: --on_existing append adds to them, replace removes "
+            "them; further videos need a new database with all videos"
         )
     if listed:
         check_no_camera(database, options.camera)

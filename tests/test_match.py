@@ -28,7 +28,7 @@ from conftest import (
 from databases import keypoints_of
 
 from colmap_av1.cli import main
-from colmap_av1.database.reading import read_images
+from colmap_av1.database.reading import read_cameras, read_images
 from colmap_av1.errors import (
     BitstreamError,
     ColmapAv1Error,
@@ -558,6 +558,9 @@ def test_focal_length_that_a_short_clip_does_not_determine_is_kept(
     short = ffmpeg("-i", clip, "-frames:v", "7", "-c:v", "copy", tmp_path / "short.mp4")
     report = match(tmp_path / "a.db", short, image_path=tmp_path / "frames")
     assert report.fixed_intrinsics
+    (camera,) = read_cameras(tmp_path / "a.db").values()
+    assert report.estimate is not None
+    assert report.estimate.focal_lengths == (camera.mean_focal_length(),) * 2
     (row,) = tables(tmp_path / "a.db")["cameras"]
     assert row[5] == 1
     assert "--Mapper.ba_refine_focal_length 0" in report.next_commands[0]

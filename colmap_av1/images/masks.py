@@ -194,9 +194,11 @@ class Masks:
 def _mask_name(image: str, masks: Collection[str]) -> str | None:
     """Name of the mask of 'a.jpg': 'a.jpg' as in COLMAP, else 'a' as in trainers; None if missing.
 
-    The extension .png of masks is left out.
+    The extension .png of masks is left out. COLMAP's masks of 'a.png' are accepted, too: `match`
+    and `reconstruct` write images of different formats by default.
     """
-    names = (image, str(PurePosixPath(image).with_suffix("")))
+    stem = str(PurePosixPath(image).with_suffix(""))
+    names = (image, stem, *(stem + extension for extension in sorted(READABLE)))
     return next((name for name in names if name in masks), None)
 
 
@@ -217,6 +219,8 @@ def read_masks(
         ImageError: there is no such file or folder, a mask cannot be read, or all are black.
     """
     if path.is_file():
+        if path.suffix.lower() != _SUFFIX:
+            raise ImageError(f"{path}: is not a PNG: {_LAYOUTS}")
         files = [path]
     elif path.is_dir():
         found = (p for p in path.rglob("*") if p.suffix.lower() == _SUFFIX and p.is_file())

@@ -84,7 +84,9 @@ class JointEstimate:
             apart; None if no such images have enough matches.
         long_range_largest: its 90th percentile.
         dynamic_share: share of dynamic pixels, which have no matches.
-        focal_lengths: the shortest and the longest focal length of the registered images in pixels.
+        focal_lengths: the shortest and the longest focal length of the registered images in pixels,
+            in the cameras of the database: the estimated ones unless the images hardly determine
+            them, or the database already has cameras.
     """
 
     num_registered: tuple[int, ...]
@@ -171,7 +173,12 @@ def match_jointly(
     if first.adjusted.seams_warning is not None:
         warnings.append(first.adjusted.seams_warning)
     matches = posed.matches.result
-    focal = [camera.mean_focal_length() for camera in first.placed.camera_of_image]
+    registered = {image.name for image in first.placed.images}
+    focal = [
+        camera.mean_focal_length()
+        for camera, name in zip(cameras, image_set.images.names, strict=True)
+        if name in registered
+    ]
     return JointMatches(
         cameras=cameras,
         focal_length=_focal_length(run, cameras[0]),

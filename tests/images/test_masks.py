@@ -72,13 +72,13 @@ def test_single_mask_applies_to_all_frames(
         assert len(xy) > 0.8 * (len(whole[name]) - num_on_black(whole[name], LEFT))
 
 
-def test_masks_of_images_are_read_in_both_layouts(clip: Path, tmp_path: Path) -> None:
+def test_masks_of_images_are_read_in_each_layout(clip: Path, tmp_path: Path) -> None:
     """COLMAP appends .png to the image name; trainers replace the extension by .png."""
     names = [f"frame_{i:06d}.jpg" for i in range(0, NUM_FRAMES, 3)]
     found = []
-    for layout in ("colmap", "trainers"):
+    for layout, ending in (("colmap", ".jpg.png"), ("of_png", ".png.png"), ("trainers", ".png")):
         for i, name in enumerate(names):
-            file = f"{name}.png" if layout == "colmap" else Path(name).with_suffix(".png")
+            file = Path(name).stem + ending
             write(tmp_path / layout / file, LEFT if i == 0 else LEFT * 0 + 1)
         how = options(tmp_path / layout, every=3, image_name="frame_%06d.jpg")
         match(tmp_path / f"{layout}.db", clip, options=how)
@@ -86,7 +86,7 @@ def test_masks_of_images_are_read_in_both_layouts(clip: Path, tmp_path: Path) ->
     assert list(found[0]) == names
     for i, name in enumerate(names):
         assert (num_on_black(found[0][name], LEFT) == 0) == (i == 0)
-        assert np.array_equal(found[0][name], found[1][name])
+        assert all(np.array_equal(found[0][name], other[name]) for other in found[1:])
 
 
 @pytest.mark.parametrize("preset", ["default", "dense"])
