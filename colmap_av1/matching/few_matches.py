@@ -17,6 +17,9 @@ from colmap_av1.matching.image_matches import MatchedImages, used_pairs
 # to 37 %, clips without jerks have 53 % and more, with matches from motion or from SIFT. Models
 # that COLMAP's mappers bent at a jerk by 0.7 to 1 % of their extent had 5 to 25 %.
 _FEW = 0.4
+# A folder has no gaps if its images have at least this share of their matches with images of other
+# folders, which hold them together: photos of a scene that a video shows, for example.
+_SHARED = 0.3
 # The usual number comes from up to this many gaps before and after.
 _NEARBY = 10
 # Number of gaps that a warning names.
@@ -31,7 +34,8 @@ def few_match_gaps(
 ) -> tuple[Gap, ...]:
     """Find gaps with far fewer matches across them than across the gaps before and after.
 
-    Gaps without any matches are left out: the images on either side become separate models.
+    Gaps without any matches are left out: the images on either side become separate models. So are
+    those of images that are held together by the images of other videos.
 
     Args:
         pairs: integers [m, 2] image indices of the pairs that mappers use.
@@ -53,8 +57,13 @@ def few_match_gaps(
     np.add.at(change, ends[:, 0], num_inliers[inside])
     np.subtract.at(change, ends[:, 1], num_inliers[inside])
     across = np.cumsum(change)
+    row_of, count = row[pairs].ravel(), np.repeat(num_inliers, 2)
+    outside = np.bincount(row_of, count * np.repeat(~inside, 2), minlength=len(rows))
+    is_shared = outside >= _SHARED * np.bincount(row_of, count, minlength=len(rows))
     found: list[Gap] = []
-    for own in rows.values():
+    for own, is_held in zip(rows.values(), is_shared.tolist(), strict=True):
+        if is_held:
+            continue
         share = _share_of_usual(across[place[own[0]] : place[own[-1]]])
         for is_few, gaps in groupby(range(len(share)), key=lambda g: share[g] < _FEW):
             if is_few:

@@ -32,6 +32,9 @@ _ENOUGH = 100
 # A seam with few points is not disconnected if this share of the median number of points have views
 # before and after it, however far apart: the parts of a cut video may see the same place elsewhere.
 _ELSEWHERE = 0.5
+# If the images of other folders see at least this share of the points of a folder's images, they
+# hold these images together: photos of a scene that a video shows, for example.
+_SHARED = 0.5
 # A point has depth if its parallax exceeds this many pixels, several times the error of an
 # observation.
 _LEAST_PARALLAX = 2.0
@@ -49,7 +52,8 @@ _DEEP = 100
 class Seams:
     """The points at each seam: between neighbours in time of the same camera and folder.
 
-    Only points with at least three views count. A model may be bent at seams of these kinds:
+    Folders whose images are held together by those of others have no seams, see `_SHARED`. Only
+    points with at least three views count. A model may be bent at seams of these kinds:
 
     - `doubtful`: far fewer points than usual connect the sides;
     - `few_points`: the doubtful seams that even fewer points connect;
@@ -180,12 +184,18 @@ def model_seams(
         all_images: names of the images that were mapped. Those that the model lacks count in the
             distance between two images.
     """
-    images, seams = images_in_time(model.images)
-    seams = [k for k in seams if images[k].name not in photos and images[k + 1].name not in photos]
+    images, neighbours = images_in_time(model.images)
     views, point, xyz = _seen_points(model, images)
     num_images, num_seams = len(images), max(len(images) - 1, 0)
+    is_inside = np.isin(np.arange(num_seams), neighbours)
+    sequence = np.cumsum(np.append(True, ~is_inside)) if num_images else np.empty(0, np.int64)
+    shared = _shared_points(sequence[views], point)
+    seams = [
+        k
+        for k in neighbours
+        if shared[sequence[k]] < _SHARED and not {images[k].name, images[k + 1].name} & {*photos}
+    ]
     is_seam = np.isin(np.arange(num_seams), seams)
-    sequence = np.cumsum(np.append(True, ~is_seam)) if num_images else np.empty(0, np.int64)
     is_near = (np.diff(point) == 0) & (np.diff(views) <= _REACH)
     near = np.flatnonzero(is_near & (np.diff(sequence[views]) == 0))
     first, last = (np.full(len(xyz), fill) for fill in (num_images, -1))
@@ -231,6 +241,23 @@ def model_seams(
         num_scaled=between(deep_from, deep_to + 1)[seams],
         num_deep=np.minimum(before, after)[seams],
     )
+
+
+def _shared_points(sequence: NDArray[np.int64], point: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The share of the points of each sequence that other sequences see, too.
+
+    Args:
+        sequence: int64 [n] sequence of each view, from 1.
+        point: int64 [n] its point.
+
+    Returns:
+        float64 [num_sequences + 1].
+    """
+    num_sequences = int(sequence.max(initial=0)) + 1
+    seen, seen_in = np.divmod(np.unique(point * num_sequences + sequence), num_sequences)
+    others = (np.bincount(seen) > 1)[seen]
+    count = np.bincount(seen_in, minlength=num_sequences)
+    return np.bincount(seen_in, others, minlength=num_sequences) / np.maximum(count, 1)
 
 
 def images_in_time(images: Sequence[ModelImage]) -> tuple[list[ModelImage], list[int]]:
