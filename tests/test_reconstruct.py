@@ -315,6 +315,20 @@ def test_tracks_of_another_length_are_matched_again(copy: Path) -> None:
     assert not {"tracks", "matches"} & set(reconstruct(SCENE, copy, options=shorter).resumed)
 
 
+def test_gaussians_of_an_earlier_model_are_removed(copy: Path) -> None:
+    """Brush would begin with them. Files of other programs are kept."""
+    own, other = copy / "init.ply", copy / "other.ply"
+    other.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+    assert reconstruct(SCENE, copy, gaussians=own, options=OPTIONS).gaussians == own
+    assert reconstruct(SCENE, copy, options=OPTIONS).warnings == ()
+    assert own.exists()  # the model is the same
+    strict = replace(OPTIONS, triangulate=TriangulateOptions(min_observations=6))
+    (warning,) = reconstruct(SCENE, copy, options=strict).warnings
+    assert "init.ply" in warning
+    assert not own.exists()
+    assert other.exists()
+
+
 def test_changed_option_redoes_the_stages_that_depend_on_it(
     made: ReconstructReport, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -50,6 +50,9 @@ _SH0 = 0.28209479177387814
 _REST = 45
 # Number of points processed at a time, to limit memory.
 _CHUNK = 100_000
+# A line near the start of the files that this module writes.
+_MADE_BY = "comment made by colmap-av1 --gaussians"
+_HEADER_START = 200
 
 
 @dataclass(frozen=True)
@@ -199,7 +202,7 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(_REST)]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    header = ["ply", "format binary_little_endian 1.0", "comment made by colmap-av1 --gaussians"]
+    header = ["ply", "format binary_little_endian 1.0", _MADE_BY]
     header += [f"element vertex {len(gaussians.xyz)}"]
     header += [*(f"property float {name}" for name in names), "end_header"]
     try:
@@ -210,6 +213,25 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
                 file.write(_records(gaussians, slice(first, first + _CHUNK)).tobytes())
     except OSError as error:
         raise WriteError(cannot_write(path, error)) from error
+
+
+def remove_gaussians_in(folder: Path) -> list[Path]:
+    """Remove the files of `write_gaussians` in a folder, and return them.
+
+    Raises:
+        WriteError: a file cannot be removed.
+    """
+    removed = []
+    for path in sorted(folder.glob("*.ply")):
+        try:
+            with path.open("rb") as file:
+                is_own = f"\n{_MADE_BY}\n".encode() in file.read(_HEADER_START)
+            if is_own:
+                path.unlink()
+                removed.append(path)
+        except OSError as error:
+            raise WriteError(cannot_write(path, error)) from error
+    return removed
 
 
 def write_model_gaussians(path: Path, model: Path) -> None:
