@@ -694,7 +694,7 @@ def _densify_options(
             masks=given.masks,
             encode=given.encode,
             read=given.read,
-            keep_stream=given.keep_stream,
+            keep_stream=given.keep_stream if videos[0].source.conversion is not None else None,
             reencode=given.reencode,
         )
     )

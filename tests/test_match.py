@@ -610,14 +610,19 @@ def test_forward_motion_is_detected(street: Street, clip: Path, tmp_path: Path) 
     assert "--init_min_tri_angle 4" in ours
 
 
-def test_printed_command_densifies_the_same_frames_and_masks(clip: Path, tmp_path: Path) -> None:
+def test_printed_command_densifies_the_same_frames_and_masks(
+    clip: Path, encode: Encode, tmp_path: Path
+) -> None:
     write_image(tmp_path / "mask.png", np.full((128, 192, 3), 255, np.uint8))
     options = MatchOptions(
         masks=MaskOptions(tmp_path / "mask.png"), keep_stream=tmp_path / "kept.mp4"
     )
-    of_names = match(tmp_path / "a.db", clip, options=options).next_commands[2]
+    h264 = encode(make_frames(16), tmp_path / "h264.mp4", "-c:v", "libx264")
+    of_names = match(tmp_path / "a.db", h264, options=options).next_commands[2]
+    of_av1 = match(tmp_path / "c.db", clip, options=options).next_commands[2]
     of_images = match(tmp_path / "b.db", clip, image_path=tmp_path / "images").next_commands[2]
     assert "--first_number 0" in of_names
     assert f"--mask_path {tmp_path / 'mask.png'}" in of_names
     assert f"--keep_stream {tmp_path / 'kept.mp4'}" in of_names
+    assert "--keep_stream" not in of_av1  # it is not converted
     assert "--first_number" not in of_images

@@ -127,9 +127,12 @@ def choose_images(
             frames = skip_blurred(frames, lambda asked: _sharpness(decode(set(asked))))
         chosen = ChosenImages(image_names(options.file_name, frames.tolist()), frames)
     if len(chosen.frames) < 2:
+        remedy = "add images of other frames" if existing else "choose more frames"
+        if num_frames < 2:
+            remedy = "give a longer video"
         raise ImageError(
-            f"{len(chosen.frames)} of {num_frames} frames become images: matches need two or more: "
-            f"{'give a longer video' if num_frames < 2 else 'choose more frames'}"
+            f"{len(chosen.frames)} of {num_frames} frames {'are' if existing else 'become'} "
+            f"images: matches need two or more: {remedy}"
         )
     return chosen
 

@@ -171,9 +171,7 @@ def check_image_folder(
         raise ImageError(f"{existing_parent}: is a file: give a folder for the images")
     is_complete = not isinstance(names, str) and all(image_file(root, n).exists() for n in names)
     if not is_complete and not os.access(existing_parent, os.W_OK | os.X_OK):
-        raise ImageError(
-            f"{existing_parent}: no permission to write images there: give another folder"
-        )
+        raise ImageError(f"{root}: no permission to write images there: give another folder")
     if isinstance(names, str):
         regex = pattern_regex(names)
         present = [p.name for p in root.iterdir()] if root.is_dir() else []

@@ -92,9 +92,10 @@ def pair_images(
         keypoints = image_keypoints(tracks, chosen.frames.tolist())
         pairs = schedule_pairs(keypoints, options)
         if needed and tracks.num_frames < min_length:
+            shorter = ", or --min_length 2" if tracks.num_frames > 2 else ""
             raise VideoError(
                 f"{video}: the video has {tracks.num_frames} frames, a track needs {min_length}: "
-                "give a longer video, or --min_length 2"
+                f"give a longer video{shorter}"
             )
         if needed and len(pairs) == 0:
             raise nothing_to_match(video, options)

@@ -22,7 +22,11 @@ from av.stream import Disposition
 
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
 from colmap_av1.util.memory import check_memory
-from colmap_av1.video.cut_off import is_fragmented_mp4_cut, is_matroska_cut
+from colmap_av1.video.cut_off import (
+    is_fragmented_mp4_cut,
+    is_matroska_cut,
+    is_mp4_without_index,
+)
 from colmap_av1.video.unchanged import FileState, file_state
 
 # Edit lists drop or hide samples that a later frame may reference, so all samples are read.
@@ -381,6 +385,11 @@ def open_container(path: Path, *, apply_edits: bool = False) -> Iterator[Any]:
         if isinstance(error, PermissionError):
             raise VideoError(
                 f"{path}: no permission to read it: change its permissions or give another file"
+            ) from error
+        if is_mp4_without_index(path):
+            raise VideoError(
+                f"{path}: its end is missing, with the index of its frames, so the recording or "
+                "copy is incomplete: give another copy, or repair it"
             ) from error
         raise VideoError(
             f"{path}: not a video, or damaged before its first frame ({reason_of(error)}): give "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -77,20 +78,37 @@ def is_fragmented_mp4_cut(path: Path) -> bool:
 
     Other MP4 files list their samples in the box `moov`, so missing packets can be counted.
     """
+    boxes = list(_boxes(path))
+    end = boxes[-1][1] if boxes else None
+    is_fragmented = any(name == b"moof" for name, _ in boxes)
+    return is_fragmented and end is not None and end > path.stat().st_size
+
+
+def is_mp4_without_index(path: Path) -> bool:
+    """Whether an MP4 file ends before the box that lists its samples, which cameras write last."""
+    names = [name for name, _ in _boxes(path)]
+    return names[:1] == [b"ftyp"] and b"moov" not in names
+
+
+def _boxes(path: Path) -> Iterator[tuple[bytes, int | None]]:
+    """Type and end of each box of an MP4 file outside other boxes.
+
+    The end is None if the box extends to the end of the file or has an invalid size. It lies behind
+    the end of a file that is cut off inside the box.
+    """
     with path.open("rb") as file:
         size = file.seek(0, 2)
         at = 0
-        is_fragmented = False
         while at < size:
             file.seek(at)
             head = file.read(16)
             length = int.from_bytes(head[:4], "big")
-            is_fragmented |= head[4:8] == b"moof"
             if length == 1:
                 length = int.from_bytes(head[8:16], "big")
-            if len(head) < 8 or at + length > size:
-                return is_fragmented
-            if length < 8:  # the box extends to the end of the file, or is damaged
-                return False
+            if len(head) < 8:
+                yield b"", size + 1
+                return
+            yield head[4:8], at + length if length >= 8 else None
+            if length < 8:
+                return
             at += length
-        return False

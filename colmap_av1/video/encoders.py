@@ -164,9 +164,9 @@ def find_encoder(options: EncodeOptions) -> tuple[str, str]:
             f"no AV1 encoder: {tried} with {' or '.join(programs) or 'any ffmpeg'} "
             f"({reasons[-1] if reasons else 'there is none'}): {remedy}"
         )
+    why = "; ".join(dict.fromkeys(reasons)) or "there is no ffmpeg"
     raise EncodeError(
-        f"the encoder does not work here ({'; '.join(reasons) or 'there is no ffmpeg'}): give "
-        "another --encoder, such as auto"
+        f"the encoder does not work here ({why}): give another --encoder, such as auto"
     )
 
 

@@ -100,6 +100,7 @@ BAD = [
     (["--video", "text.mp4"], "text.mp4: not a video"),
     (["--video", "empty.mp4"], "empty.mp4: "),
     (["--video", "tone.mp4"], "tone.mp4: "),
+    (["--video", "unfinished.mp4"], "incomplete"),
     (["--video", "h264.mp4", "--encoder", "x264"], "encoder"),
     (["--video", "h264.mp4", "--keep_stream", "text.mp4"], "text.mp4: "),
     (["--video", "h264.mp4", "--keep_stream", "absent/s.mp4"], "absent: "),
@@ -125,7 +126,8 @@ def bad_files(
     (folder / "text.mp4").write_text("this is not a video\n" * 100)
     (folder / "empty.mp4").touch()
     ffmpeg("-f", "lavfi", "-i", "sine=duration=0.2", folder / "tone.mp4")
-    encode(make_frames(3), folder / "h264.mp4", "-c:v", "libx264")
+    h264 = encode(make_frames(3), folder / "h264.mp4", "-c:v", "libx264")
+    (folder / "unfinished.mp4").write_bytes(h264.read_bytes()[:-3000])
     small = encode(make_frames(3, 96, 64), folder / "small.mp4")
     (folder / "small").mkdir()
     ffmpeg("-i", small, "-start_number", "0", folder / "small/frame_%06d.png")

@@ -89,8 +89,8 @@ class LinkReport:
             return ()
         names = some_names(self.unlinked_photos)
         return (
-            f"{len(self.unlinked_photos)} photos have nothing in common with any video and are "
-            f"not connected: {names}",
+            f"{len(self.unlinked_photos)} of the photos have nothing in common with any video and "
+            f"are not connected: {names}",
         )
 
 
