@@ -100,7 +100,7 @@ def write_matches(
             raise ValueError(f"matches of images {i} and {j} refer to keypoints that do not exist")
 
     def fill(connection: sqlite3.Connection) -> None:
-        image_ids = _place_images(connection, path, names, cameras, on_existing)
+        image_ids = _ids_of_images(connection, path, names, cameras, on_existing)
         if on_existing == "error":
             _check_nothing_lost(connection, path, dict(zip(image_ids, names, strict=True)))
         elif on_existing == "replace":
@@ -140,13 +140,13 @@ def check_writable(database: str | os.PathLike[str]) -> None:
         raise DatabaseError(f"{path}: no permission to write a database there: give another path")
 
     def fill(connection: sqlite3.Connection) -> None:
-        _place_images(connection, path, (), None, "error")
+        _ids_of_images(connection, path, (), None, "error")
 
     if not new:
         write_existing(path, fill)
 
 
-def _place_images(
+def _ids_of_images(
     connection: sqlite3.Connection,
     path: Path,
     names: Sequence[str],

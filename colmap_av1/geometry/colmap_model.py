@@ -253,8 +253,8 @@ def write_model(
     lengths = np.diff(points.offsets)
     owner = np.repeat(np.arange(len(lengths)), lengths)
     by_image, bounds = grouped(points.image, len(images))
-    place = np.empty(len(points.image), dtype=np.int64)
-    place[by_image] = np.arange(len(by_image)) - np.repeat(bounds[:-1], np.diff(bounds))
+    index_in_image = np.empty(len(points.image), dtype=np.int64)
+    index_in_image[by_image] = np.arange(len(by_image)) - np.repeat(bounds[:-1], np.diff(bounds))
     with (folder / "images.bin").open("wb") as file:
         file.write(struct.pack("<Q", len(images)))
         for image, start, stop in zip(images, bounds[:-1], bounds[1:], strict=True):
@@ -270,7 +270,7 @@ def write_model(
 
     elements = np.empty(len(points.image), dtype=_ELEMENT)
     elements["image_id"] = np.array([i.image_id for i in images], dtype=np.uint32)[points.image]
-    elements["point2D_idx"] = place
+    elements["point2D_idx"] = index_in_image
     with (folder / "points3D.bin").open("wb") as file:
         file.write(struct.pack("<Q", len(lengths)))
         for first in range(0, len(lengths), _CHUNK):

@@ -164,8 +164,8 @@ def choose_frames(
         return _at_rate(times - times[0], options.fps)
     if options.num_images is None:
         return np.arange(num_frames, dtype=np.int32)
-    place = times if times is not None else np.arange(num_frames, dtype=np.float64)
-    return _evenly_spread(place, options.num_images)
+    position = times if times is not None else np.arange(num_frames, dtype=np.float64)
+    return _evenly_spread(position, options.num_images)
 
 
 def spread_in_parallax(tracks: Tracks, num_images: int) -> NDArray[np.int32]:
@@ -451,9 +451,9 @@ def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:
     return np.flatnonzero(is_last & (tick < num_ticks)).astype(np.int32)
 
 
-def _evenly_spread(places: NDArray[np.float64], num_images: int) -> NDArray[np.int32]:
+def _evenly_spread(positions: NDArray[np.float64], num_images: int) -> NDArray[np.int32]:
     """Choose frames evenly by the positions of all frames, which ascend."""
-    count = len(places)
+    count = len(positions)
     if num_images > count:
         warnings.warn(
             f"the video has {count} frames, {num_images} images are wanted: all of its frames "
@@ -461,16 +461,16 @@ def _evenly_spread(places: NDArray[np.float64], num_images: int) -> NDArray[np.i
             stacklevel=2,
         )
         return np.arange(count, dtype=np.int32)
-    wanted = np.linspace(places[0], places[-1], num_images)
-    return _distinct(_nearest(places, wanted), count)
+    wanted = np.linspace(positions[0], positions[-1], num_images)
+    return _distinct(_nearest(positions, wanted), count)
 
 
-def _nearest(places: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
+def _nearest(positions: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
     """Index of the position nearest to each wanted one, the earlier of two; positions ascend."""
-    above = np.clip(np.searchsorted(places, wanted), 1, max(len(places) - 1, 1))
-    if len(places) == 1:
+    above = np.clip(np.searchsorted(positions, wanted), 1, max(len(positions) - 1, 1))
+    if len(positions) == 1:
         return np.zeros(len(wanted), dtype=np.int64)
-    nearer_below = wanted - places[above - 1] <= places[above] - wanted
+    nearer_below = wanted - positions[above - 1] <= positions[above] - wanted
     return np.asarray(np.where(nearer_below, above - 1, above), dtype=np.int64)
 
 

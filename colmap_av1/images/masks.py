@@ -35,13 +35,13 @@ class VideoMasks:
     """The masks of a video.
 
     Attributes:
-        place: the file or folder of the masks, for messages.
+        path: the file or folder of the masks, for messages.
         everywhere: the mask of all frames.
         of_frames: a mask for each frame, in order.
         of_images: masks of images, by their names in the video's folder, with or without extension.
     """
 
-    place: str
+    path: str
     everywhere: Mask | None = None
     of_frames: tuple[Mask, ...] = ()
     of_images: Mapping[str, Mask] | None = None
@@ -67,7 +67,7 @@ class VideoMasks:
             if mask.size not in sizes:
                 wanted = " or ".join("{}x{}".format(*s) for s in dict.fromkeys(sizes))
                 raise ImageError(
-                    f"{self.place}: a mask is {mask.size[0]}x{mask.size[1]}, the pictures are "
+                    f"{self.path}: a mask is {mask.size[0]}x{mask.size[1]}, the pictures are "
                     f"{wanted}: give masks of that size"
                 )
         if self.of_images is None:
@@ -80,7 +80,7 @@ class VideoMasks:
             found = (str(PurePosixPath(n).with_suffix(_SUFFIX)) for n in self.of_images)
             if not any(named.fullmatch(name) for name in found):
                 raise ImageError(
-                    f"{self.place}: none of its {len(self.of_images)} masks is named like an image "
+                    f"{self.path}: none of its {len(self.of_images)} masks is named like an image "
                     f"({options.file_name}{_SUFFIX}), and the video has a different number of "
                     f"frames: {_LAYOUTS}"
                 )
@@ -137,7 +137,7 @@ class VideoMasks:
         missing = [name for name, mask in found.items() if mask is None]
         if missing:
             raise ImageError(
-                f"{self.place}: holds {len(masks)} masks, but lacks those of {len(missing)} of "
+                f"{self.path}: holds {len(masks)} masks, but lacks those of {len(missing)} of "
                 f"{len(names)} images, such as '{missing[0]}{_SUFFIX}': {_LAYOUTS}"
             )
         return [masks[mask] for mask in found.values() if mask is not None]
@@ -169,12 +169,12 @@ class Masks:
         """The masks of the video whose images lie in a folder; None if it has no masks."""
         if self.everywhere is not None:
             return VideoMasks(str(self.path), self.everywhere)
-        place = str(self.path / label)
+        own_path = str(self.path / label)
         if label in self.of_frames:
-            return VideoMasks(place, of_frames=self.of_frames[label])
+            return VideoMasks(own_path, of_frames=self.of_frames[label])
         start = f"{label}/" if label else ""
         own = {n.removeprefix(start): m for n, m in self.of_images.items() if n.startswith(start)}
-        return VideoMasks(place, of_images=own) if own else None
+        return VideoMasks(own_path, of_images=own) if own else None
 
     def of_photo(self, name: str, size: tuple[int, int]) -> Mask | None:
         """The mask of a photo; None if it has no mask.

@@ -142,9 +142,9 @@ def _some_images(paired: PairedImages, images: Sequence[int]) -> PairedImages:
     """Select images, given in ascending order, and the pairs among them."""
     if len(images) == len(paired.keypoints):
         return paired
-    place = np.full(len(paired.keypoints), -1, dtype=np.int32)
-    place[list(images)] = np.arange(len(images))
-    pairs = place[paired.pairs]
+    index = np.full(len(paired.keypoints), -1, dtype=np.int32)
+    index[list(images)] = np.arange(len(images))
+    pairs = index[paired.pairs]
     kept = np.flatnonzero((pairs >= 0).all(axis=1))
     return PairedImages(
         [paired.keypoints[i] for i in images], pairs[kept], [paired.matches[k] for k in kept]

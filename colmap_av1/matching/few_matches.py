@@ -48,11 +48,11 @@ def few_match_gaps(
         rows.setdefault(videos[i], []).append(i)
     # Order the images by video, so that no pair of one video crosses a gap of another.
     order = [i for own in rows.values() for i in own]
-    place, row = np.empty(len(names), np.int64), np.empty(len(names), np.int64)
-    place[order] = np.arange(len(order))
+    rank, row = np.empty(len(names), np.int64), np.empty(len(names), np.int64)
+    rank[order] = np.arange(len(order))
     row[order] = np.repeat(np.arange(len(rows)), [len(own) for own in rows.values()])
     inside = row[pairs[:, 0]] == row[pairs[:, 1]]
-    ends = np.sort(place[pairs[inside]], axis=1)
+    ends = np.sort(rank[pairs[inside]], axis=1)
     change = np.zeros(len(names), dtype=np.int64)
     np.add.at(change, ends[:, 0], num_inliers[inside])
     np.subtract.at(change, ends[:, 1], num_inliers[inside])
@@ -64,7 +64,7 @@ def few_match_gaps(
     for own, is_held in zip(rows.values(), is_shared.tolist(), strict=True):
         if is_held:
             continue
-        share = _share_of_usual(across[place[own[0]] : place[own[-1]]])
+        share = _share_of_usual(across[rank[own[0]] : rank[own[-1]]])
         for is_few, gaps in groupby(range(len(share)), key=lambda g: share[g] < _FEW):
             if is_few:
                 together = list(gaps)

@@ -361,8 +361,8 @@ class _Search:
             count = found.count.copy()
             count[list(bad)] = np.minimum(count[list(bad)], most)
             num_before = len(bad)
-            order, rank, place = self._order(count)
-            first = last = None  # places in the order of the first and the latest certain pair
+            order, rank, number = self._order(count)
+            first = last = None  # indices in the order of the first and the latest certain pair
             for i, k in enumerate(order.tolist()):
                 if not possible[k] or count[k] < limits.init_min_num_inliers:
                     continue
@@ -371,7 +371,7 @@ class _Search:
                 if first is not None:
                     if rank[i] >= rank[first] + _NUM_THREADS:
                         break
-                    if place[i] > 2 * place[first] + 1:
+                    if number[i] > 2 * number[first] + 1:
                         continue
                 if is_sound[k]:
                     has_begun = self._begins(k, limits)
@@ -399,7 +399,7 @@ class _Search:
 
         Returns:
             int64 [num_pairs] the pairs, the rank of the image with which each is tried, and its
-            place among the pairs of that image.
+            number among the pairs of that image.
         """
         pairs = self._matched.pairs
         total = np.bincount(pairs.ravel(), np.repeat(count, 2))

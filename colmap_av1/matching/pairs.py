@@ -148,9 +148,9 @@ def pair_matches(a: ImageKeypoints, b: ImageKeypoints) -> NDArray[np.uint32]:
     Returns:
         uint32 [n, 2] keypoint indices (in a, in b), ascending in both columns.
     """
-    place, is_shared = _places_in(b, a)
+    index, is_shared = _indices_in(b, a)
     in_a = np.flatnonzero(is_shared)
-    return np.column_stack([in_a, place[in_a]]).astype(np.uint32)
+    return np.column_stack([in_a, index[in_a]]).astype(np.uint32)
 
 
 def schedule_pairs(
@@ -215,10 +215,10 @@ def schedule_pairs(
 
 
 def _count_shared(a: ImageKeypoints, b: ImageKeypoints) -> int:
-    return int(np.count_nonzero(_places_in(b, a)[1]))
+    return int(np.count_nonzero(_indices_in(b, a)[1]))
 
 
-def _places_in(
+def _indices_in(
     other: ImageKeypoints, own: ImageKeypoints
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Where another image observes the tracks of an image.
@@ -229,8 +229,8 @@ def _places_in(
     """
     if other.track.size == 0:
         return np.zeros(own.track.size, np.int64), np.zeros(own.track.size, np.bool_)
-    place = np.minimum(np.searchsorted(other.track, own.track), other.track.size - 1)
-    return place, other.track[place] == own.track
+    index = np.minimum(np.searchsorted(other.track, own.track), other.track.size - 1)
+    return index, other.track[index] == own.track
 
 
 def _longest_track_span(keypoints: Sequence[ImageKeypoints]) -> int:

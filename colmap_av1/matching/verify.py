@@ -132,7 +132,7 @@ class _View:
             without a focal length prior.
         focal: mean focal length in pixels.
         to_flat: float64 [3, 3] maps undistorted pixels to `flat`.
-        place: int32 [n] rank of each keypoint in an order whose beginnings are all spread over the
+        rank: int32 [n] rank of each keypoint in an order whose beginnings are all spread over the
             image.
     """
 
@@ -141,7 +141,7 @@ class _View:
     flat: _Floats | None
     focal: float
     to_flat: _Floats
-    place: NDArray[np.int32]
+    rank: NDArray[np.int32]
 
 
 def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera, seed: int) -> _View:
@@ -158,9 +158,9 @@ def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera, seed: int) -> _Vie
             )
         focal = float(camera.mean_focal_length())
         flat = np.ascontiguousarray(rays.T * focal)
-    place = _spread_order(pixels, (width, height), seed)
+    rank = _spread_order(pixels, (width, height), seed)
     to_flat = np.diag([focal, focal, 1.0]) @ np.linalg.inv(camera.calibration_matrix())
-    return _View(camera, keypoints.xy, flat, focal, to_flat, place)
+    return _View(camera, keypoints.xy, flat, focal, to_flat, rank)
 
 
 def _spread_order(x: _Floats, size: tuple[int, int], seed: int) -> NDArray[np.int32]:
@@ -190,9 +190,9 @@ def _spread_order(x: _Floats, size: tuple[int, int], seed: int) -> NDArray[np.in
     first = np.searchsorted(sorted_cell, sorted_cell)
     turn = np.empty(len(x), dtype=np.uint16)
     turn[by_cell] = np.minimum(count - first, np.iinfo(np.uint16).max)
-    place = np.empty(len(x), dtype=np.int32)
-    place[order[np.argsort(turn, kind="stable")]] = count
-    return place
+    rank = np.empty(len(x), dtype=np.int32)
+    rank[order[np.argsort(turn, kind="stable")]] = count
+    return rank
 
 
 def _verify_pair(
@@ -209,10 +209,10 @@ def _verify_pair(
     if len(matches) < max(search.options.min_num_inliers, MIN_MATCHES):
         return _degenerate()
     # The order is spread over the whole image, so its subset is spread over the matched part.
-    places = a.place.take(matches[:, 0])
+    ranks = a.rank.take(matches[:, 0])
     num_refined = min(len(matches), max(MAX_REFINED, search.options.max_samples))
-    nearest = np.argpartition(places, num_refined - 1)[:num_refined]
-    order = nearest[np.argsort(places[nearest])]
+    nearest = np.argpartition(ranks, num_refined - 1)[:num_refined]
+    order = nearest[np.argsort(ranks[nearest])]
     if a.flat is not None and b.flat is not None:
         return _verify_calibrated(a, b, matches, order, search)
     return _verify_uncalibrated(a, b, matches, order, search)

@@ -87,13 +87,13 @@ def map_poses(
         settings["tolerance"] = _EARLY_TOLERANCE
     progress("poses", 0, num_images)
     sizes: list[int] = []
-    placed = 0
+    registered = 0
 
     def hear(word: str, value: str) -> None:
-        nonlocal placed, sizes
-        if word == "placed":
-            placed += 1
-            progress("poses", min(placed, num_images), num_images)
+        nonlocal registered, sizes
+        if word == "registered":
+            registered += 1
+            progress("poses", min(registered, num_images), num_images)
         elif word == "models":
             sizes = json.loads(value)
 

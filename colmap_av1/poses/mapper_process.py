@@ -43,7 +43,7 @@ def run_child(settings: dict[str, Any]) -> None:
         elif settings["task"] == "start":
             print("names", json.dumps(_start(settings)), file=channel)
         else:
-            found = run_mapping(settings, lambda: print("placed", file=channel))
+            found = run_mapping(settings, lambda: print("registered", file=channel))
             print("models", json.dumps(found), file=channel)
     except Exception as error:
         channel.write(f"failed {' '.join(str(error).split())}\n")
@@ -52,12 +52,12 @@ def run_child(settings: dict[str, Any]) -> None:
     channel.close()
 
 
-def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = None) -> list[int]:
+def run_mapping(settings: dict[str, Any], on_image: Callable[[], None] | None = None) -> list[int]:
     """Map a database, see `run_mapper`.
 
     Args:
         settings: see `_mapping_settings`.
-        placed: called whenever the incremental mapper registers an image.
+        on_image: called whenever the incremental mapper registers an image.
 
     Returns:
         Number of registered images of each model.
@@ -80,7 +80,10 @@ def run_mapping(settings: dict[str, Any], placed: Callable[[], None] | None = No
         if settings["growth"] is not None:
             how.ba_global_frames_ratio = how.ba_global_points_ratio = settings["growth"]
         # pycolmap accepts None for a callback, although its stub does not declare it.
-        callbacks: Any = {"initial_image_pair_callback": placed, "next_image_callback": placed}
+        callbacks: Any = {
+            "initial_image_pair_callback": on_image,
+            "next_image_callback": on_image,
+        }
         models = pycolmap.incremental_mapping(database, each, each, options=how, **callbacks)
     else:
         global_options = pycolmap.GlobalPipelineOptions(

@@ -117,16 +117,16 @@ def cost_chart(columns: Sequence[Column]) -> bytes:
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(10, 0.9 + 0.27 * len(columns)), layout="constrained")
         axis: Any = figure.subplots()
-        place = np.arange(len(columns))
+        rows = np.arange(len(columns))
         start = np.zeros(len(columns))
         for stage, shade in shades.items():
             width = np.array([c.cpu_seconds.get(stage, 0.0) for c in columns])
             if width.any():
-                axis.barh(place, width, left=start, color=shade, label=stage, height=0.7)
+                axis.barh(rows, width, left=start, color=shade, label=stage, height=0.7)
             start += width
-        for y, total in zip(place, start, strict=True):
+        for y, total in zip(rows, start, strict=True):
             axis.text(total, y, f" {total:,.0f} s" if total else " -", va="center", fontsize=8)
-        axis.set_yticks(place, [c.name for c in columns])
+        axis.set_yticks(rows, [c.name for c in columns])
         axis.invert_yaxis()
         axis.margins(x=0.1)
         axis.set_title("CPU time, s", loc="left", fontsize=9)
@@ -210,16 +210,16 @@ def crop_window(reference: _Image) -> tuple[slice, slice]:
 
 
 def _bars(axis: Any, panel: _Panel, colours: Mapping[str, str]) -> None:
-    place = list(range(len(colours)))
+    rows = list(range(len(colours)))
     known = [value is not None and np.isfinite(value) for value in panel.values]
     lengths = [
         value if is_known else 0 for value, is_known in zip(panel.values, known, strict=True)
     ]
-    axis.barh(place, lengths, color=list(colours.values()), height=0.7)
-    for y, length, is_known in zip(place, lengths, known, strict=True):
+    axis.barh(rows, lengths, color=list(colours.values()), height=0.7)
+    for y, length, is_known in zip(rows, lengths, known, strict=True):
         label = format(length, panel.spelling) if is_known else "-"
         axis.text(length, y, f" {label}", va="center", fontsize=8)
-    axis.set_yticks(place, list(colours))
+    axis.set_yticks(rows, list(colours))
     axis.invert_yaxis()
     axis.margins(x=0.18)
     axis.xaxis.set_visible(False)

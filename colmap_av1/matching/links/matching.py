@@ -216,7 +216,7 @@ def supported_links(
         image_set: the images. Photos have no neighbours: their links are confirmed by a third
             image that is linked to both.
     """
-    place = {
+    position = {
         image: k + _VIDEO_OFFSET * int(image_set.sequence[image]) for k, image in enumerate(images)
     }
     photos = set(range(image_set.images_of(len(image_set.videos)).start, len(image_set.sequence)))
@@ -226,7 +226,7 @@ def supported_links(
         for (i, j), g in zip(pairs, links.geometries, strict=True)
         if (i, j) in loops and len(g.inlier_matches) >= _MIN_LOOP_INLIERS
     }
-    places = {(place[i], place[j]) for i, j in sure}
+    positions = {(position[i], position[j]) for i, j in sure}
     around = range(-_SUPPORT_REACH, _SUPPORT_REACH + 1)
     linked: dict[int, set[int]] = {}
     for i, j in sure:
@@ -234,8 +234,8 @@ def supported_links(
         linked.setdefault(j, set()).add(i)
 
     def is_supported(i: int, j: int) -> bool:
-        a, b = place[i], place[j]
-        near = ((a + da, b + db) in places for da in around for db in around if da or db)
+        a, b = position[i], position[j]
+        near = ((a + da, b + db) in positions for da in around for db in around if da or db)
         return any(near) or bool({i, j} & photos and linked[i] & linked[j])
 
     supported = {pair for pair in sure if is_supported(*pair)}

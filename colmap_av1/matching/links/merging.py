@@ -35,9 +35,9 @@ def merge_links(
         used.setdefault(j, set()).update(geometry.inlier_matches[:, 1].tolist())
     num_tracks = next_track(matched.keypoints)
     keypoints = list(matched.keypoints)
-    place: dict[int, NDArray[np.int64]] = {}
+    keypoint: dict[int, NDArray[np.int64]] = {}
     for image, indices in used.items():
-        keypoints[image], place[image] = _with_features(
+        keypoints[image], keypoint[image] = _with_features(
             keypoints[image], features[image].xy, sorted(indices), num_tracks
         )
         num_tracks += len(indices)
@@ -49,7 +49,7 @@ def merge_links(
     for k, (i, j) in enumerate(links.pairs.tolist()):
         geometry = links.geometries[k]
         inliers = np.column_stack(
-            [place[i][geometry.inlier_matches[:, 0]], place[j][geometry.inlier_matches[:, 1]]]
+            [keypoint[i][geometry.inlier_matches[:, 0]], keypoint[j][geometry.inlier_matches[:, 1]]]
         ).astype(np.uint32)
         own = replace(geometry, inlier_matches=inliers)
         if (i, j) in rows:
@@ -75,7 +75,7 @@ def _with_features(
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
 
-    place = np.full(len(xy), -1, dtype=np.int64)
+    keypoint = np.full(len(xy), -1, dtype=np.int64)
     taken: dict[int, tuple[float, int]] = {}
     if len(keypoints.xy):
         distance, nearest = cKDTree(keypoints.xy).query(xy[indices])
@@ -83,16 +83,16 @@ def _with_features(
             if d <= _JOIN_DISTANCE and d < taken.get(k, (np.inf, 0))[0]:
                 taken[k] = d, index
     for k, (_, index) in taken.items():
-        place[index] = k
-    new = [index for index in indices if place[index] < 0]
-    place[new] = len(keypoints.xy) + np.arange(len(new))
+        keypoint[index] = k
+    new = [index for index in indices if keypoint[index] < 0]
+    keypoint[new] = len(keypoints.xy) + np.arange(len(new))
     return (
         replace(
             keypoints,
             xy=np.concatenate([keypoints.xy, xy[new]]).astype(np.float32),
             track=np.concatenate([keypoints.track, first_track + np.arange(len(new))]),
         ),
-        place,
+        keypoint,
     )
 
 
