@@ -258,7 +258,7 @@ def missing_end(file: VideoFile, count: int, last: Any) -> str | None:
             return f"cut off after packet {count}"
         if file.container == "obu" and end != size:
             return f"cut off after packet {count}"
-        if "matroska" in file.container and is_matroska_cut(file.path, last.pos):
+        if "matroska" in file.container and is_matroska_cut(file.path, last.pos, last.size):
             return f"cut off after packet {count}"
     if "mp4" in file.container and is_fragmented_mp4_cut(file.path):
         return f"cut off after packet {count}"

@@ -12,16 +12,17 @@ _PARENTS = (b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75", b"\xa0")
 _LONGEST_ID, _LONGEST_SIZE = 4, 8
 
 
-def is_matroska_cut(path: Path, payload: int) -> bool:
+def is_matroska_cut(path: Path, payload: int, packet_size: int) -> bool:
     """Whether a Matroska file ends inside a block or an element after it.
 
     Args:
         path: the file.
         payload: position in the file of the block's payload, which FFmpeg gives with a packet.
+        packet_size: size of that packet in bytes.
     """
     with path.open("rb") as file:
         size = file.seek(0, 2)
-        at = _end_of_block(file, payload)
+        at = _end_of_block(file, payload, packet_size)
         while at is not None and at < size:
             file.seek(at)
             head = file.read(_LONGEST_ID + _LONGEST_SIZE)
@@ -44,20 +45,26 @@ def is_matroska_cut(path: Path, payload: int) -> bool:
         return at is not None and at > size
 
 
-def _end_of_block(file: BinaryIO, payload: int) -> int | None:
-    """The position where the block with this payload ends; None if no block is found."""
+def _end_of_block(file: BinaryIO, payload: int, packet_size: int) -> int | None:
+    """The position where the block with this payload ends; None if no block is found.
+
+    The header is read backwards, so that bytes of its size may look like the beginning of another
+    header. The packet's size tells them apart, although a compressed packet may be a little longer
+    or shorter than its block.
+    """
     start = max(payload - _LONGEST_SIZE - 1, 0)
     file.seek(start)
     before = file.read(payload - start)
-    for width in range(1, min(_LONGEST_SIZE + 1, len(before))):
-        size = before[-width:]
-        if _vint_length(size, _LONGEST_SIZE) == width and before[-width - 1 : -width] in {
-            _SIMPLE_BLOCK,
-            _BLOCK,
-        }:
-            content = _vint(size)
-            return None if content is None else payload + content
-    return None
+    contents = [
+        content
+        for width in range(1, min(_LONGEST_SIZE + 1, len(before)))
+        if before[-width - 1 : -width] in {_SIMPLE_BLOCK, _BLOCK}
+        and _vint_length(before[-width:], _LONGEST_SIZE) == width
+        and (content := _vint(before[-width:])) is not None
+    ]
+    if not contents:
+        return None
+    return payload + min(contents, key=lambda content: abs(content - packet_size))
 
 
 def _vint_length(data: bytes, longest: int) -> int:
