@@ -189,7 +189,7 @@ def model_seams(
     num_images, num_seams = len(images), max(len(images) - 1, 0)
     is_inside = np.isin(np.arange(num_seams), neighbours)
     sequence = np.cumsum(np.append(True, ~is_inside)) if num_images else np.empty(0, np.int64)
-    shared = _shared_points(sequence[views], point)
+    shared = _shared_points(sequence[views], point, num_sequences=int(sequence.max(initial=0)) + 1)
     seams = [
         k
         for k in neighbours
@@ -243,17 +243,19 @@ def model_seams(
     )
 
 
-def _shared_points(sequence: NDArray[np.int64], point: NDArray[np.int64]) -> NDArray[np.float64]:
+def _shared_points(
+    sequence: NDArray[np.int64], point: NDArray[np.int64], *, num_sequences: int
+) -> NDArray[np.float64]:
     """The share of the points of each sequence that other sequences see, too.
 
     Args:
-        sequence: int64 [n] sequence of each view, from 1.
+        sequence: int64 [n] sequence of each view.
         point: int64 [n] its point.
+        num_sequences: number of sequences; some may have no views.
 
     Returns:
-        float64 [num_sequences + 1].
+        float64 [num_sequences].
     """
-    num_sequences = int(sequence.max(initial=0)) + 1
     seen, seen_in = np.divmod(np.unique(point * num_sequences + sequence), num_sequences)
     others = (np.bincount(seen) > 1)[seen]
     count = np.bincount(seen_in, minlength=num_sequences)

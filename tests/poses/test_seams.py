@@ -129,6 +129,18 @@ def test_images_held_together_by_those_of_another_folder_have_no_seams(tmp_path:
     assert len(seams_with([[k, k + 1, k + 2] for k in (20, 26)] * 500).num_points) == 28
 
 
+def test_models_without_points_have_empty_seams(tmp_path: Path) -> None:
+    write_row(tmp_path, [[0, 1]], 0)  # points with two views do not count
+    assert seams_of(read_model(tmp_path)).num_points.tolist() == [0] * 29
+    # The points of the last folder have too few views.
+    write_row(tmp_path, [[k, k + 1, k + 2] for k in range(20)] + [[28, 29]], 0)
+    model = read_model(tmp_path)
+    for image in model.images.values():
+        folder = "a" if int(Path(image.name).stem) < 25 else "b"
+        image.name = f"{folder}/{image.name}"
+    assert len(seams_of(model).num_points) == 28
+
+
 def write_row(folder: Path, views: list[list[int]], again: int, *, num_cameras: int = 1) -> None:
     """Write a model of thirty images in a row.
 
