@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
-from colmap_av1.images.files import grey_within
+from colmap_av1.images.files import READABLE, grey_within
 from colmap_av1.images.names import (
     check_new_name,
     frames_of_images,
     image_file,
     image_names,
     last_number,
+    natural_key,
     natural_order,
+    pattern_regex,
 )
 from colmap_av1.images.recognising import check_content, frames_by_content, frames_near
 from colmap_av1.options import ImageOptions
@@ -75,6 +77,40 @@ class ChosenImages:
     def some(self, index: Sequence[int] | NDArray[np.integer[Any]]) -> ChosenImages:
         """Select images by their indices, which must ascend."""
         return ChosenImages([self.names[i] for i in index], self.frames[np.asarray(index, int)])
+
+
+def existing_images(folder: str | os.PathLike[str], options: ImageOptions) -> list[str]:
+    """Images in a folder, unless an earlier run of this package wrote them.
+
+    An earlier run wrote them if frame 0 exists under the name that new images get, since other
+    programs count from 1; if the options choose frames by time, and all names are those of new
+    images; or if `frame_list` lists all of them and more.
+
+    Args:
+        folder: the folder; it need not exist.
+        options: how images are chosen and named.
+
+    Returns:
+        File names in natural order; none if an earlier run wrote them.
+
+    Raises:
+        ImageError: the list of frames cannot be read.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        return []
+    names = {
+        p.name
+        for p in root.iterdir()
+        if p.suffix.lower() in READABLE and not p.name.startswith(".")
+    }
+    is_own = image_names(options.file_name, [0])[0] in names
+    if options.fps is not None or options.num_images is not None:
+        regex = pattern_regex(options.file_name)
+        is_own |= all(regex.fullmatch(name) for name in names)
+    if options.frame_list is not None:
+        is_own |= names < {name for *_, name in _read_entries(options.frame_list, options)}
+    return [] if is_own else sorted(names, key=natural_key)
 
 
 def choose_images(

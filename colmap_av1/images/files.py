@@ -22,8 +22,6 @@ from colmap_av1.errors import ImageError, VideoError, cannot_write
 from colmap_av1.images.names import (
     WRITE_PARAMETERS,
     image_file,
-    image_names,
-    natural_key,
     pattern_regex,
 )
 from colmap_av1.options.images import check_extension
@@ -120,30 +118,6 @@ def check_images_there(folder: str | os.PathLike[str], names: Sequence[str]) -> 
             f"{Path(folder) / missing}: is missing, and cannot be written because the images "
             "differ in size from the video: give the folder that holds all images"
         )
-
-
-def existing_images(folder: str | os.PathLike[str], pattern: str) -> list[str]:
-    """Images in a folder, unless an earlier run of this package wrote them.
-
-    Args:
-        folder: the folder; it need not exist.
-        pattern: pattern of the names of new images, see `image_names`.
-
-    Returns:
-        File names in natural order; empty if frame 0 exists under the name that the pattern gives
-        it, since other programs count from 1.
-    """
-    root = Path(folder)
-    if not root.is_dir():
-        return []
-    names = [
-        p.name
-        for p in root.iterdir()
-        if p.suffix.lower() in READABLE and not p.name.startswith(".")
-    ]
-    if image_names(pattern, [0])[0] in names:
-        return []
-    return sorted(names, key=natural_key)
 
 
 def check_image_folder(

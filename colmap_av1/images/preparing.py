@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.images.choosing import check_frame_list
+from colmap_av1.images.choosing import check_frame_list, existing_images
 from colmap_av1.images.files import (
     blur_warning,
     check_image_folder,
     check_images_there,
-    existing_images,
     has_shape,
     image_size,
     size_of_images,
@@ -203,7 +202,7 @@ def _fit(
     display, video_size = video.display, video.picture_size
     existing = dict(listed)
     if folder is not None and not existing:
-        names = existing_images(folder, options.file_name)
+        names = existing_images(folder, options)
         existing = {name: image_size(folder / name) for name in names}
     back = _way_back(video, existing, folder)
     if back is not None:

@@ -369,3 +369,23 @@ def test_every_applies_to_existing_images(
     with pytest.raises(OptionError, match="num_images"):
         run("c.db", num_images=3)
     assert not (tmp_path / "c.db").exists()
+
+
+@pytest.mark.parametrize("choice", [{"fps": 10}, {"frame_list": "list.txt"}])
+def test_missing_images_of_an_earlier_run_are_written_again(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, choice: dict[str, Any]
+) -> None:
+    """Frame 0 need not be among them."""
+    monkeypatch.chdir(tmp_path)
+    Path("list.txt").write_text("2 a.png\n4 b.png\n6\n8\n10\n")
+    options = replace(DENSE, images=ImageOptions(**choice))
+    first = match("0.db", clip, image_path="images", options=options)
+    names = sorted(path.name for path in Path("images").iterdir())
+    assert "frame_000000.png" not in names
+    assert first.num_written_images == len(names) > 3
+    for number, num_missing in enumerate((0, 2), start=1):
+        for name in names[:num_missing]:
+            (Path("images") / name).unlink()
+        again = match(f"{number}.db", clip, image_path="images", options=options)
+        assert (again.num_images, again.num_written_images) == (len(names), num_missing)
+    assert sorted(path.name for path in Path("images").iterdir()) == names

@@ -8,7 +8,7 @@ from typing import Any
 
 from colmap_av1.errors import VideoError
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.images.files import existing_images
+from colmap_av1.images.choosing import existing_images
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_prepared
 from colmap_av1.matching.image_matches import pair_images, verify_images
 from colmap_av1.options import (
@@ -113,12 +113,14 @@ def choose_footage(
         options.refine,
         options.verify,
     )
+    # A folder that is not given only holds images that this stage wrote.
+    existing = existing_images(images, options.images) if image_path is not None else []
     depends_on = [
         file_digest(video.path),
         given,
         images,
         digest_if_there(options.images.frame_list),
-        [file_digest(images / n) for n in existing_images(images, options.images.file_name)],
+        [file_digest(images / name) for name in existing],
     ]
     facts = run_stage_in(folder, depends_on, make, products=[images]).result
     for name in ("frames", "size", "warnings"):
