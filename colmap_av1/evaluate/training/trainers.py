@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,7 +197,9 @@ def train(
         states = [_plain(state) for state in _states(renders, stops, references)]
         return {"seconds": measured.seconds, "states": states}
 
-    depends_on = (trainer, given, iterations, stops)
+    words = words_of_trainer(trainer) if trainer != GSPLAT else []
+    programs = [file_digest(Path(word)) for word in words if os.path.isfile(word)]
+    depends_on = (trainer, programs, given, iterations, stops)
     finished = run_stage_in(folder, depends_on, make, products=[renders], made_by=_CODE)
     states = tuple(_milestone(state) for state in finished.result["states"])
     last = renders / str(iterations) if states else renders
@@ -235,15 +238,32 @@ def _command(
 
 
 def match_renders(folder: Path, references: Sequence[Path]) -> list[Path]:
-    """The rendering of each reference: by file name, else by order if the numbers are equal.
+    """The rendering of each reference: by name, else by order if the numbers are equal.
+
+    Folders and extensions do not count.
 
     Raises:
-        EvaluationError: the folder does not have a rendering of each reference.
+        EvaluationError: the folder does not have a rendering of each reference, or names are not
+            unique.
     """
     found = [p for p in folder.rglob("*") if p.suffix.lower() in _PICTURES]
     by_stem = {path.stem: path for path in found}
-    if all(reference.stem in by_stem for reference in references):
-        return [by_stem[reference.stem] for reference in references]
+    wanted = [reference.stem for reference in references]
+    twice = next((s for s, n in Counter(wanted).items() if n > 1), None)
+    if twice is not None:
+        raise EvaluationError(
+            f"several test images are named '{twice}', and renderings are matched by name: give "
+            "images of different names"
+        )
+    stems = Counter(path.stem for path in found)
+    twice = next((stem for stem in wanted if stems[stem] > 1), None)
+    if twice is not None:
+        raise EvaluationError(
+            f"{folder}: has several pictures named '{twice}': let the trainer's command write only "
+            "the renderings into {renders}"
+        )
+    if all(stem in by_stem for stem in wanted):
+        return [by_stem[stem] for stem in wanted]
     if len(found) == len(references):
         return sorted(found, key=lambda path: natural_key(path.name))
     raise EvaluationError(
