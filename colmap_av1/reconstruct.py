@@ -33,11 +33,7 @@ from colmap_av1.poses.track_stage import (
     stage_of_video,
     track_stage,
 )
-from colmap_av1.splats.gaussians import (
-    check_gaussians_path,
-    remove_gaussians_in,
-    write_model_gaussians,
-)
+from colmap_av1.splats.gaussians import check_gaussians_path, write_model_gaussians
 from colmap_av1.splats.reconstruct_model import ModelResult
 from colmap_av1.splats.reconstruct_models import FurtherModel, further_models, written_model
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
@@ -254,13 +250,6 @@ def reconstruct(
         except ColmapAv1Error:  # A file that changed during the run may be the cause.
             check_unchanged(*run.files)
             raise
-        if "model" not in report.resumed:  # Brush would begin with Gaussians of an earlier model
-            removed = [
-                f"{path}: removed, it was made from an earlier model: give --gaussians again"
-                for path in remove_gaussians_in(output)
-                if gaussians is None or path.resolve() != Path(gaussians).resolve()
-            ]
-            report = replace(report, warnings=(*report.warnings, *removed))
         if gaussians is not None:
             with clock.measure("gaussians"):
                 write_model_gaussians(Path(gaussians), output / "sparse" / "0")

@@ -215,23 +215,20 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
         raise WriteError(cannot_write(path, error)) from error
 
 
-def remove_gaussians_in(folder: Path) -> list[Path]:
-    """Remove the files of `write_gaussians` in a folder, and return them.
+def remove_gaussians_in(folder: Path) -> None:
+    """Remove the files of `write_gaussians` in a folder.
 
     Raises:
         WriteError: a file cannot be removed.
     """
-    removed = []
     for path in sorted(folder.glob("*.ply")):
         try:
             with path.open("rb") as file:
                 is_own = f"\n{_MADE_BY}\n".encode() in file.read(_HEADER_START)
             if is_own:
                 path.unlink()
-                removed.append(path)
         except OSError as error:
             raise WriteError(cannot_write(path, error)) from error
-    return removed
 
 
 def write_model_gaussians(path: Path, model: Path) -> None:

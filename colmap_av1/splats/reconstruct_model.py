@@ -42,6 +42,7 @@ from colmap_av1.poses.posed_images import (
     triangulate_in,
 )
 from colmap_av1.poses.run import Run
+from colmap_av1.splats.gaussians import remove_gaussians_in
 from colmap_av1.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
@@ -298,6 +299,7 @@ def model_stage(
             if masked:
                 shown = valid if options.moving == "mask" else given
                 _write_masks(partial / _MASKS, images, cameras, shown)
+        remove_gaussians_in(run.output)  # Brush would begin with those of an earlier model
         focal = [camera.mean_focal_length() for camera in cameras.values()]
         return ModelResult(
             num_points=len(cloud.xyz),
