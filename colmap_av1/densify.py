@@ -356,9 +356,10 @@ def _check_distorted(model: Path) -> None:
         ModelError: it is one.
     """
     folder = model.resolve()
+    output = folder.parents[1]
     # The report of further models, in OUTPUT/model_1/sparse/0, is in OUTPUT.
-    is_output = folder.parts[-2:] == ("sparse", "0")
-    if is_output and any(map(_has_undistorted, folder.parents[1:3])):
+    reports = [output, *([output.parent] if output.name.startswith("model_") else [])]
+    if folder.parts[-2:] == ("sparse", "0") and any(map(_has_undistorted, reports)):
         raise ModelError(
             f"{model}: its images are undistorted, but tracks are not: run reconstruct with other "
             "options for points, or with --undistort 0, or give the model of a mapper"

@@ -94,11 +94,14 @@ def model_crossings(reconstruction: pycolmap.Reconstruction, database: Path) -> 
         database: COLMAP database, which is not changed.
 
     Raises:
-        DatabaseError: the database cannot be read, or is damaged.
+        DatabaseError: the database cannot be read, is damaged, or lists no image of the model.
     """
     images, gaps = images_in_time([*posed_images(reconstruction).values()])
+    video = np.cumsum(~np.isin(np.arange(len(images)) - 1, gaps))
     matches, fitting = (np.zeros(len(images) + 1, np.int64) for _ in range(2))
     for i, j, fits in _fitting(images, reconstruction.cameras, database):
+        if video[i] != video[j]:  # such a pair crosses no gap between neighbours in time
+            continue
         for change, count in ((matches, len(fits)), (fitting, int(np.count_nonzero(fits)))):
             change[i] += count
             change[j] -= count
@@ -123,6 +126,11 @@ def _fitting(
             for image_id, name in connection.execute("SELECT image_id, name FROM images")
             if name in place
         }
+        if not of_id:
+            raise DatabaseError(
+                f"{database}: lists no image of the model: give the database that the model was "
+                "mapped from"
+            )
         rays: dict[int, _Floats] = {}
         for image_id, *row in connection.execute(
             "SELECT image_id, rows, cols, data FROM keypoints WHERE rows > 0"
@@ -147,11 +155,7 @@ def _fitting(
             views = [images[of_id[k]] for k in (a, b)]
             focal = np.mean([cameras[view.camera_id].mean_focal_length() for view in views])
             xa, xb = rays[a][:, matches[:, 0]], rays[b][:, matches[:, 1]]
-            error = float(focal) * _errors(views[0].cam_from_world, views[1].cam_from_world, xa, xb)
+            essential = essential_of_poses(*(view.cam_from_world for view in views))
+            error = float(focal) * sampson_error(essential, xa, xb)
             i, j = sorted((of_id[a], of_id[b]))
             yield i, j, error[np.isfinite(error)] <= _MAX_ERROR
-
-
-def _errors(a: _Floats, b: _Floats, xa: _Floats, xb: _Floats) -> _Floats:
-    """Sampson error of matched rays [2, n] for the poses of two images, float64 [n]."""
-    return sampson_error(essential_of_poses(a, b), xa, xb)

@@ -17,6 +17,7 @@ from colmap_av1.geometry.colmap_model import (
     read_model,
 )
 from colmap_av1.geometry.observable import framed_box, has_observable_depth
+from colmap_av1.images.names import natural_key
 
 _Floats = NDArray[np.float64]
 
@@ -34,7 +35,7 @@ class Scene:
         points: float64 [n, 3] positions, in the order of the point ids.
         colours: uint8 [n, 3] RGB.
         observable: bool [n] points with observable depth; the depth of the others is assumed.
-        images: the registered images, in the order of their names.
+        images: the registered images, in the natural order of their names.
         centres: float64 [m, 3] camera centres.
         axes: float64 [3, 3] unit vectors to the right, up and back for the average camera.
     """
@@ -84,7 +85,9 @@ def read_scene(model: str | os.PathLike[str], *, up: _Floats | None = None) -> S
     """
     reconstruction = read_model(model)
     points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
-    images = sorted(posed_images(reconstruction).values(), key=lambda image: image.name)
+    images = sorted(
+        posed_images(reconstruction).values(), key=lambda image: natural_key(image.name)
+    )
     poses = np.array([image.cam_from_world for image in images])
     # A camera looks along its third axis; the second axis points down.
     back, top = normalised(-poses[:, 2, :3].mean(axis=0)), -poses[:, 1, :3].mean(axis=0)

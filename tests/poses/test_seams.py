@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+import sqlite3
 from collections.abc import Collection
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +15,7 @@ import pytest
 
 from colmap_av1.check.crossings import model_crossings
 from colmap_av1.cli import main
+from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, read_model, write_model
 from colmap_av1.geometry.posed_model import posed_model
@@ -207,6 +210,29 @@ def test_wrongly_joined_parts_are_reported(
     unfit = model_crossings(model, database).warning
     assert unfit is not None
     assert "undistorted" in unfit
+
+
+def test_matches_between_folders_cross_no_gap(made: ReconstructReport, tmp_path: Path) -> None:
+    """Two videos that are joined wrongly; the seams of each are sound."""
+    model = read_model(made.output / "sparse" / "0")
+    database = shutil.copyfile(made.output / "database.db", tmp_path / "a.db")
+    shift = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([5.0, 0.0, 0.0]))
+    by_name = sorted(model.images.values(), key=lambda image: image.name)
+    middle = len(by_name) // 2
+    first_of_second = by_name[middle].name
+    for image in by_name[middle:]:
+        image.frame.set_cam_from_world(image.camera_id, image.cam_from_world() * shift)
+    for image in by_name:
+        image.name = f"{'a' if image.name < first_of_second else 'b'}/{image.name}"
+    with pytest.raises(DatabaseError, match="no image"):
+        model_crossings(model, database)
+    with sqlite3.connect(database) as connection:
+        folder = "CASE WHEN name < ? THEN 'a/' ELSE 'b/' END"
+        connection.execute(f"UPDATE images SET name = {folder} || name", (first_of_second,))
+    connection.close()
+    found = model_crossings(model, database)
+    assert len(found.pairs) == len(by_name) - 2
+    assert found.wrong == []
 
 
 def _walk_with_a_turn(

@@ -68,17 +68,14 @@ def import_hloc(
                 f"{footage.image_path}"
             )
         list_images(footage, database)
-        pairs = _write_hloc(found, set(names), database)
+        _write_hloc(found, set(names), database)
     with clock.measure("verification"):
-        listing = database.with_name("pairs.txt")
-        listing.write_text("".join(f"{a} {b}\n" for a, b in pairs))
-        pycolmap.verify_matches(database, listing)
+        pycolmap.geometric_verification(database)
     return Filled(clock.seconds)
 
 
-def _write_hloc(found: HlocMatches, names: set[str], database: Path) -> list[tuple[str, str]]:
-    """Write keypoints and matches of some images; returns the pairs."""
-    pairs = []
+def _write_hloc(found: HlocMatches, names: set[str], database: Path) -> None:
+    """Write keypoints and matches of some images."""
     with pycolmap.Database.open(database) as rows:
         ids = {image.name: image.image_id for image in rows.read_all_images()}
         for name, xy in zip(found.names, found.keypoints, strict=True):
@@ -88,5 +85,3 @@ def _write_hloc(found: HlocMatches, names: set[str], database: Path) -> list[tup
             pair = found.names[i], found.names[j]
             if names.issuperset(pair):
                 rows.write_matches(ids[pair[0]], ids[pair[1]], between)
-                pairs.append(pair)
-    return pairs
