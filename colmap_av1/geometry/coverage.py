@@ -134,10 +134,26 @@ class PosedCamera:
         x, y = xy[:, 0], xy[:, 1]
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         if self._seen_rays is None:
-            seen = own[inside]
-            apart = np.linalg.norm(self.rays(xy[inside]) * seen[:, 2:] - seen, axis=1)
-            inside[inside] = apart <= _SAME_RAY * np.linalg.norm(seen, axis=1)
+            inside[inside] = self.sees(own[inside], xy[inside])
         return index[inside], xy[inside], own[inside, 2]
+
+    def sees(self, own: _Floats, xy: _Floats) -> NDArray[np.bool_]:
+        """Whether points lie in the field of view of their pixels.
+
+        Outside it, the distortion model may project points into the image.
+
+        Args:
+            own: float64 [n, 3] points in front of the camera, in its coordinates.
+            xy: float64 [n, 2] their projections.
+        """
+        if self.camera.model_name == "PINHOLE":
+            return np.ones(len(own), np.bool_)
+        if self._seen_rays is not None:
+            low, high = self._seen_rays
+            slope = own[:, :2] / own[:, 2:]
+            return np.asarray(((slope >= low) & (slope <= high)).all(axis=1))
+        apart = np.linalg.norm(self.rays(xy) * own[:, 2:] - own, axis=1)
+        return np.asarray(apart <= _SAME_RAY * np.linalg.norm(own, axis=1))
 
 
 def views_of(

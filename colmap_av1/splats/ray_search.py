@@ -166,14 +166,16 @@ def _correlate(one: Grey, xy: _Floats, two: Grey, at: _Floats) -> NDArray[np.flo
 def _seen_at(view: PosedCamera, other: PosedCamera, rays: _Floats, inverse: _Floats) -> _Floats:
     """Project points on rays [n, 3] at inverse depths [n or 1, d] to pixels [n, d, 2].
 
-    The pixels are in the image `other`, and NaN behind its camera.
+    The pixels are in the image `other`, and NaN behind its camera or outside its field of view.
     """
     turn = other.cam_from_world[:, :3] @ view.cam_from_world[:, :3].T
     way = other.cam_from_world[:, 3] - turn @ view.cam_from_world[:, 3]
     # Coordinate by coordinate: NumPy is several times slower on rows of three elements.
     seen = (turn @ rays.T)[:, :, None] + way[:, None, None] * inverse
     seen[:, seen[2] <= 0] = np.nan
-    at = np.asarray(other.camera.img_from_cam(seen.reshape(3, -1).T))
+    points = seen.reshape(3, -1).T
+    at = np.asarray(other.camera.img_from_cam(points)).reshape(-1, 2)
+    at[~other.sees(points, at)] = np.nan
     return at.reshape(*seen.shape[1:], 2)
 
 
