@@ -23,6 +23,7 @@ from av.stream import Disposition
 from colmap_av1.errors import BitstreamError, NotAv1Error, VideoError
 from colmap_av1.util.memory import check_memory
 from colmap_av1.video.cut_off import (
+    is_fragmented_mp4,
     is_fragmented_mp4_cut,
     is_matroska_cut,
     is_mp4_without_index,
@@ -135,6 +136,8 @@ def describe(container: Any, stream: Any, state: FileState) -> VideoFile:
     rate = stream.average_rate or stream.guessed_rate
     is_timed = not (_is_ivf_without_rate(state.path) or _is_mp4_without_scale(container, stream))
     num_packets, duration = stream.frames or None, _stream_duration(container, stream)
+    if num_packets and "mov" in container.format.name and is_fragmented_mp4(state.path):
+        num_packets = None  # the container counts only those before the fragments
     if container.format.name == "ivf" and is_timed and rate and stream.time_base != 1 / rate:
         # The header holds the number of frames or the duration in time units, depending on the
         # program that wrote it, so both are measured.

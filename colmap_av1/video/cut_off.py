@@ -80,6 +80,11 @@ def _vint(data: bytes) -> int | None:
     return None if value == (1 << bits) - 1 else value
 
 
+def is_fragmented_mp4(path: Path) -> bool:
+    """Whether an MP4 file has fragments, whose samples its index does not list."""
+    return any(name == b"moof" for name, _ in _boxes(path))
+
+
 def is_fragmented_mp4_cut(path: Path) -> bool:
     """Whether a fragmented MP4 file ends inside a box.
 

@@ -23,7 +23,7 @@ from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
 from colmap_av1.video.container import open_stream
 from colmap_av1.video.decoding import decode_frames
-from colmap_av1.video.facts import read_video
+from colmap_av1.video.facts import count_shown, read_video
 
 TEMPORAL_DELIMITER = 2
 KIT = SHARED / "conformance"
@@ -216,6 +216,16 @@ def test_encrypted_videos_are_reported_as_encrypted(
             list(read_motion(path))
     assert main(["encode", "--video", str(path), "--output", str(tmp_path / "out.mp4")]) == 2
     assert not (tmp_path / "out.mp4").exists()
+
+
+def test_packets_after_the_index_of_a_recording_are_counted(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """The index at the beginning lists only those before the first fragment."""
+    h264 = ffmpeg("-i", clip, "-c:v", "libx264", "-g", "4", tmp_path / "h264.mp4")
+    path = ffmpeg("-i", h264, "-c", "copy", "-movflags", "frag_keyframe", tmp_path / "f.mp4")
+    video = read_video(path)
+    assert count_shown(video) == len(list(decode_frames(path))) == 16
 
 
 def test_data_after_the_last_packet_is_not_reported(
