@@ -20,7 +20,7 @@ from colmap_av1.errors import ModelError, OptionError, VideoError
 from colmap_av1.options import BatchOptions, MatchOptions
 from colmap_av1.options.fields import Options
 from colmap_av1.options.words import words_of
-from colmap_av1.util.digests import digest_if_there, digest_of
+from colmap_av1.util.digests import digest_of, digest_of_tree
 from colmap_av1.util.failures import Failure, failure_of
 from colmap_av1.util.files import scratch_folder
 from colmap_av1.util.processes import bound
@@ -194,7 +194,7 @@ def _depends_on(work: Work) -> list[object]:
     matching = options if isinstance(options, MatchOptions) else getattr(options, "match", None)
     if not isinstance(matching, MatchOptions):
         return [work.task, options, None, work.batch.write_images]
-    files = [digest_if_there(path) for path in matching.files]
+    files = [digest_of_tree(path) for path in matching.files]
     return [work.task, options, files, work.batch.write_images]
 
 

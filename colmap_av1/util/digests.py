@@ -49,6 +49,19 @@ def digest_if_there(path: str | os.PathLike[str] | None) -> str | None:
     return file_digest(Path(path)) if path is not None and Path(path).is_file() else None
 
 
+def digest_of_tree(path: str | os.PathLike[str] | None) -> list[tuple[str, str]]:
+    """Paths and digests of a file, or of all files in a folder; none if it is missing or None.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    if path is None:
+        return []
+    root = Path(path)
+    files = [root] if root.is_file() else sorted(p for p in root.rglob("*") if p.is_file())
+    return [(file.relative_to(root).as_posix(), file_digest(file)) for file in files]
+
+
 @functools.cache
 def _known_digest(path: Path, *_: int) -> str:
     return _read_digest(path)
