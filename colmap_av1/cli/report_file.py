@@ -36,7 +36,7 @@ def write_report_json(namespace: argparse.Namespace, report: Any, **others: Any)
         "cpu_seconds": cpu_seconds(),
         **others,
     }
-    _write(namespace.report_json, facts, with_folder=True)
+    _write(namespace.report_json, facts)
 
 
 @contextmanager
@@ -84,10 +84,9 @@ def _check_report(path: Path, outputs: Iterable[str | None]) -> None:
         raise OptionError(f"{path}: exists and is not a report: give another file")
 
 
-def _write(path: str, facts: dict[str, Any], *, with_folder: bool = False) -> None:
+def _write(path: str, facts: dict[str, Any]) -> None:
     try:
-        if with_folder:
-            Path(path).parent.mkdir(parents=True, exist_ok=True)
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
         with whole_file(Path(path)) as partial:
             partial.write_text(json.dumps(plain(facts, renamed), indent=1, allow_nan=False) + "\n")
     except OSError as error:

@@ -178,7 +178,9 @@ def read_inputs(
         check_is_plane(own.path, own.projection, own.picture_size[0])
     _check_different(videos)
     _check_rates(videos, options.camera)
-    places = [os.path.splitext(os.path.abspath(v.path))[0] for v in videos]
+    places = []
+    if len(videos) > 1:  # the images of a single video have no folder
+        places = [os.path.splitext(os.path.abspath(v.path))[0] for v in videos]
     if folder is not None:
         places.append(os.path.abspath(folder))
     labels = labels_of(places)
@@ -213,6 +215,8 @@ def labels_of(places: Sequence[str]) -> list[str]:
     Raises:
         OptionError: the names are not distinct with all parent folders either.
     """
+    if not places:
+        return []
     parts = [[_plain(part) for part in Path(place).parts[1:]] or ["root"] for place in places]
     for count in range(1, max(map(len, parts)) + 1):
         labels = ["_".join(part[-count:]) for part in parts]

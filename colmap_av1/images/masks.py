@@ -224,7 +224,9 @@ def read_masks(
         files = [path]
     elif path.is_dir():
         found = (p for p in path.rglob("*") if p.suffix.lower() == _SUFFIX and p.is_file())
-        visible = [p for p in found if not p.name.startswith(".")]
+        visible = [
+            p for p in found if not any(n.startswith(".") for n in p.relative_to(path).parts)
+        ]
         files = sorted(visible, key=lambda p: natural_key(p.relative_to(path).as_posix()))
         if not files:
             raise ImageError(f"{path}: holds no PNG: {_LAYOUTS}")

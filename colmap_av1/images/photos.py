@@ -6,13 +6,14 @@ import os
 import re
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import pycolmap
 
 from colmap_av1.errors import ImageError, cannot_write
-from colmap_av1.images.files import READABLE, image_size
+from colmap_av1.images.files import READABLE, image_size, read_image
 from colmap_av1.images.names import image_file, natural_key
 from colmap_av1.options.images import IMAGE_EXTENSIONS
 from colmap_av1.util.files import whole_file
@@ -81,7 +82,9 @@ def photo_files(folder: Path) -> tuple[list[Path], str | None]:
         for name in files:
             path = Path(parent, name).relative_to(folder)
             suffix = path.suffix.lower()
-            if suffix in READABLE and not name.startswith("."):
+            if name.startswith("."):
+                continue
+            if suffix in READABLE:
                 found.append(path)
             elif suffix in _UNREADABLE_PHOTOS:
                 unread.append(path)
@@ -129,7 +132,7 @@ def read_photos(folder: Path, files: Sequence[Path], label: str, *, flat: bool) 
         names[key] = file
         size = image_size(path)
         bitmap = pycolmap.Bitmap.read(path, as_rgb=False)
-        if bitmap is None or _is_cut_short(path):
+        if bitmap is None or _is_damaged(path):
             raise ImageError(f"{path}: is damaged: copy it again, or remove it")
         camera, focal_length = bitmap.exif_camera_model() or "", bitmap.exif_focal_length()
         place = _place_of(bitmap)
@@ -145,11 +148,17 @@ def _place_of(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
     return float(latitude), float(longitude), float(bitmap.exif_altitude() or 0)
 
 
-def _is_cut_short(path: Path) -> bool:
-    """Whether a JPEG file is truncated; decoders would fill the missing part with grey."""
+def _is_damaged(path: Path) -> bool:
+    """Whether a photo cannot be decoded as a whole.
+
+    A truncated JPEG file is found without decoding; decoders would fill the missing part with grey.
+    """
     with path.open("rb") as file:
         if file.read(len(_START_OF_IMAGE)) != _START_OF_IMAGE:
-            return False
+            with suppress(ImageError):
+                read_image(path)
+                return False
+            return True
         data = file.read()
     # Segments are skipped by their lengths because one may hold a thumbnail, which has the same
     # markers. What follows the image, such as the video of a motion photo, is not read.

@@ -210,6 +210,25 @@ def test_only_photos_that_are_cut_short_are_refused(tmp_path: Path) -> None:
                 read_photos(tmp_path, [Path(name)], "photos", flat=False)
 
 
+@pytest.mark.parametrize("ending", ["png", "tiff"])
+def test_truncated_photos_without_loss_are_refused(tmp_path: Path, ending: str) -> None:
+    picture = np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    data = cv2.imencode(f".{ending}", picture)[1].tobytes()
+    photo = Path(f"a.{ending}")
+    (tmp_path / photo).write_bytes(data)
+    assert len(read_photos(tmp_path, [photo], "photos", flat=False)) == 1
+    (tmp_path / photo).write_bytes(data[: len(data) // 2])
+    with pytest.raises(ImageError):
+        read_photos(tmp_path, [photo], "photos", flat=False)
+
+
+def test_hidden_photos_are_not_mentioned(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", np.zeros((8, 8, 3), dtype=np.uint8))
+    (tmp_path / "._b.HEIC").touch()
+    files, warning = photo_files(tmp_path)
+    assert (files, warning) == ([Path("a.png")], None)
+
+
 @pytest.mark.parametrize("ending", ["png", "jpg"])
 def test_existing_images_of_another_size_are_refused(tmp_path: Path, ending: str) -> None:
     name = f"frame_000003.{ending}"

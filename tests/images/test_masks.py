@@ -209,6 +209,7 @@ def test_unusable_masks_are_refused_in_one_line(
 def test_each_video_has_its_own_masks(tmp_path: Path) -> None:
     for name in ("a/1.png", "a/2.png", "b/x.jpg.png", "photos/y.png"):
         write(tmp_path / name, LEFT)
+    write(tmp_path / ".thumbnails/1.png", LEFT[::2, ::2])
     masks = read_masks(tmp_path, ["a", "b", "c"], [2, 2, 2], ["photos/y.jpg", "photos/z.jpg"])
     a, b = masks.of_video("a"), masks.of_video("b")
     assert a is not None
