@@ -39,7 +39,7 @@ _ELEMENT = np.dtype([("image_id", "<u4"), ("point2D_idx", "<u4")])
 # Sizes in bytes of the parts of COLMAP's binary files.
 _COUNT = struct.Struct("<Q")
 _SHORT_COUNT = struct.Struct("<I")
-_SMALLEST_CAMERA = _CAMERA_HEAD + 3 * 8  # SIMPLE_PINHOLE has the fewest parameters.
+_SMALLEST_CAMERA = _CAMERA_HEAD + 2 * 8  # EQUIRECTANGULAR of COLMAP 4.2: width and height
 _IMAGE_HEAD, _POINT_HEAD = 64, 43
 _RIG_HEAD, _SENSOR, _POSE = 8, 8, 56
 _FRAME_HEAD, _DATA_ID = 8 + _POSE, 16

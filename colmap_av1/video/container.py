@@ -427,9 +427,10 @@ def _find_av1_stream(container: Any, path: Path) -> Any:
 
 
 def find_video_stream(container: Any, path: Path) -> Any:
-    """The AV1 stream of a file; if there is none, the first video stream with moving pictures.
+    """The AV1 stream of a file; if there is none, a video stream with moving pictures.
 
-    Cover pictures, and the still pictures of animated AVIF and HEIF files, are skipped.
+    Of several, it is the default one, else the one with the largest pictures. Cover pictures, and
+    the still pictures of animated AVIF and HEIF files, are skipped.
 
     Raises:
         VideoError: there is no video stream.
@@ -444,7 +445,14 @@ def find_video_stream(container: Any, path: Path) -> Any:
         raise VideoError(f"{path}: has audio and a cover picture, no video: give a video")
     moving = moving or streams
     candidates = [s for s in moving if _codec_name(s) == "av1"] or moving
-    return next((s for s in candidates if s.frames != 1), candidates[0])
+    return max(candidates, key=_preference)
+
+
+def _preference(stream: Any) -> tuple[bool, bool, int]:
+    """Sort key of the video streams of a file: players show the one with the largest."""
+    is_default = bool(stream.disposition & Disposition.default)
+    context = stream.codec_context
+    return stream.frames != 1, is_default, context.width * context.height if context else 0
 
 
 def find_decodable_stream(container: Any, path: Path) -> Any:

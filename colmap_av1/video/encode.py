@@ -40,7 +40,7 @@ from colmap_av1.video.encoders import (
     reason_in_log,
     settings,
 )
-from colmap_av1.video.facts import Video, cut_off, read_video, with_counted_packets
+from colmap_av1.video.facts import Video, counted, read_video
 from colmap_av1.video.metadata.positions import read_positions
 from colmap_av1.video.metadata.telemetry import carrying, loss_of
 from colmap_av1.video.stored_frames import count_decodable
@@ -149,7 +149,7 @@ def _encode(
         raise EncodeError(f"{output.parent}: no permission to write there: give another output")
     target = output.resolve()  # a link keeps leading to the output
     remove_leftovers(target.parent, target.name)
-    file = with_counted_packets(read_video(video))
+    file, damage = counted(read_video(video))
     positions = read_positions(file) if telemetry else None
     output_format = _FORMATS[output.suffix.lower()]
     second_input, copied = carrying(file, positions, output_format) if telemetry else ([], [])
@@ -181,7 +181,6 @@ def _encode(
         mark["downscale"] = float(options.downscale or 1)
     if is_kept:
         mark["source"] = _source(path)
-    damage = cut_off(file)
     if damage is not None:
         mark["readable"] = file.num_packets
 
@@ -247,7 +246,7 @@ def stream_of(
     output = Path(keep_stream)
     if output.suffix.lower() not in _KEPT_FORMATS:
         raise OptionError(f"{output}: give a file that ends in {', '.join(_KEPT_FORMATS)}")
-    file = with_counted_packets(read_file(video))
+    file, _ = counted(read_file(video))
     if output.exists():
         if not may_read(output):
             raise OptionError(f"{output}: no permission to read it: change its permissions")
@@ -361,7 +360,7 @@ def _readable_frames(video: VideoFile, count: int, damage: str | None, *, strict
     Args:
         video: the video.
         count: number of frames that ffmpeg wrote.
-        damage: how the file is cut off, see `cut_off`.
+        damage: how the file is cut off, see `counted`.
         strict: whether damage is an error.
     """
     readable = count

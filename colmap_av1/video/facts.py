@@ -191,27 +191,21 @@ def _packets_before_damage(file: VideoFile) -> Iterator[Any]:
                 yield packet
 
 
-def cut_off(file: VideoFile) -> str | None:
-    """Describe how a file is cut off that FFmpeg treats as complete; None if it is whole.
-
-    Raises:
-        VideoError: as `decode_frames`.
-    """
-    count, last = 0, None
-    for packet in _packets_before_damage(file):
-        count, last = count + 1, packet
-    return missing_end(file, count, last)
-
-
-def with_counted_packets(file: _File) -> _File:
+def counted(file: _File) -> tuple[_File, str | None]:
     """The same facts, with the packets counted if the container does not give their number.
+
+    Returns:
+        The facts, and how the file is cut off if FFmpeg treats it as complete, otherwise None.
 
     Raises:
         VideoError: as `decode_frames`.
     """
     if file.num_packets is not None:
-        return file
-    return dataclasses.replace(file, num_packets=sum(1 for _ in _packets_before_damage(file)))
+        return file, None
+    count, last = 0, None
+    for packet in _packets_before_damage(file):
+        count, last = count + 1, packet
+    return dataclasses.replace(file, num_packets=count), missing_end(file, count, last)
 
 
 def count_shown(video: Video) -> int:
@@ -224,7 +218,7 @@ def count_shown(video: Video) -> int:
     """
     if video.presented is not None:
         return len(video.presented)
-    return with_counted_packets(video).num_packets or 0
+    return counted(video)[0].num_packets or 0
 
 
 def _container_crop(container: Any, stream_index: int) -> tuple[int, int, int, int]:

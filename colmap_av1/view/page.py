@@ -166,7 +166,7 @@ def write_model_page(
         gaps=[_gap_in_words(gap) for gap in report.links.gaps] if report else [],
         figures=figures,
         warnings=report.warnings if report else (),
-        commands=_commands(folder, report),
+        commands=_commands(folder),
         version=package_version(),
     )
     path = Path(output)
@@ -428,16 +428,17 @@ def _gap_in_words(gap: Gap) -> str:
     return f"gap between {gap.before} and {gap.after}: {', '.join(gap.reasons)}"
 
 
-def _commands(model: Path, report: ReconstructReport | None) -> list[tuple[str, str]]:
+def _commands(model: Path) -> list[tuple[str, str]]:
     """Suggestions for the next step: a description and a command each."""
-    if report is None:
+    folder = model.resolve().parent.parent
+    if model.resolve() != folder / "sparse" / "0" or not (folder / "images").is_dir():
         command = ["colmap-av1", "densify", "--model", str(model), "--video", "VIDEO"]
         return [("Add dense points from the video", shlex.join([*command, "--output", "OUTPUT"]))]
-    folder = shlex.quote(str(model.resolve().parent.parent))
+    name = shlex.quote(str(folder))
     return [
-        ("Train with Brush", f"brush {folder} --with-viewer"),
+        ("Train with Brush", f"brush {name} --with-viewer"),
         (
             "Train with nerfstudio",
-            f"ns-train splatfacto --data {folder} colmap --colmap-path sparse/0",
+            f"ns-train splatfacto --data {name} colmap --colmap-path sparse/0",
         ),
     ]

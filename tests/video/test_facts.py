@@ -15,7 +15,7 @@ from colmap_av1.motion.info import read_info
 from colmap_av1.motion.reading import frame_times
 from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions
 from colmap_av1.video.container import read_file
-from colmap_av1.video.facts import picture_times, read_video, with_counted_packets
+from colmap_av1.video.facts import counted, picture_times, read_video
 from colmap_av1.video.unchanged import check_unchanged
 
 
@@ -175,10 +175,31 @@ def test_packets_are_counted_if_the_container_gives_no_number(
 ) -> None:
     file = read_file(ffmpeg("-i", clip, "-c", "copy", tmp_path / f"v.{ending}"))
     assert file.num_packets in ((16,) if ending == "mp4" else (16, None))
-    counted = with_counted_packets(file)
-    assert counted.num_packets == counted.likely_num_packets == 16
+    with_count, damage = counted(file)
+    assert with_count.num_packets == with_count.likely_num_packets == 16
     assert file.likely_num_packets == (None if ending == "obu" else 16)
-    assert with_counted_packets(counted) is counted
+    assert damage is None
+    assert counted(with_count)[0] is with_count
+
+
+def test_default_or_largest_stream_is_read(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
+    two = [
+        "-i",
+        clip,
+        "-map",
+        "0:v",
+        "-map",
+        "0:v",
+        "-c:v",
+        "libx264",
+        "-filter:v:0",
+        "scale=96:-2",
+    ]
+    for number, size in (("0", (96, 64)), ("1", (192, 128))):
+        of_all = ["-disposition:v", "0", f"-disposition:v:{number}", "default"]
+        assert read_file(ffmpeg(*two, *of_all, tmp_path / f"{number}.mkv")).stored_size == size
+    equal = ffmpeg(*two, "-disposition:v", "default", tmp_path / "equal.mkv")
+    assert read_file(equal).stored_size == (192, 128)
 
 
 def test_container_without_a_decodable_picture(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:
