@@ -48,7 +48,13 @@ from colmap_av1.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import open_source
 from colmap_av1.util.cpus import one_blas_thread
-from colmap_av1.util.files import REPORT, check_new_folder, scratch_folder, whole_folder
+from colmap_av1.util.files import (
+    REPORT,
+    check_new_folder,
+    output_of_model,
+    scratch_folder,
+    whole_folder,
+)
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.kept_pictures import KeptPictures
@@ -355,11 +361,8 @@ def _check_distorted(model: Path) -> None:
     Raises:
         ModelError: it is one.
     """
-    folder = model.resolve()
-    output = folder.parents[1]
-    # The report of further models, in OUTPUT/model_1/sparse/0, is in OUTPUT.
-    reports = [output, *([output.parent] if output.name.startswith("model_") else [])]
-    if folder.parts[-2:] == ("sparse", "0") and any(map(_has_undistorted, reports)):
+    output = output_of_model(model)
+    if output is not None and _has_undistorted(output):
         raise ModelError(
             f"{model}: its images are undistorted, but tracks are not: run reconstruct with other "
             "options for points, or with --undistort 0, or give the model of a mapper"

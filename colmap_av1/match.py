@@ -522,12 +522,12 @@ def _match_images(
             raise ModelError("the database has several cameras for the images of one video")
         return _match_jointly(images, cameras, scratch, options, context)
     except (ModelError, VideoError) as error:
-        # What follows the reason is advice for `reconstruct`, or names a log that is deleted.
-        reason = str(error).rpartition(": ")[0] or str(error)
         if options.verify.verify == "joint":
-            if isinstance(error, VideoError):
-                raise
-            raise ModelError(f"{reason}: leave out --verify joint") from error
+            failure, see_log, _ = str(error).partition(": see ")
+            if see_log:  # the log is deleted with the other temporary files
+                raise ModelError(f"{failure}: leave out --verify joint") from error
+            raise
+        reason = str(error).rpartition(": ")[0] or str(error)
     videos = [_with_selected_tracks(own, options, context) for own in images.videos]
     found = _match_pairs(replace(images, videos=videos), cameras, options, context)
     if not found.depth.is_observable:
@@ -718,8 +718,7 @@ def _read_listed_images(database: Path, options: MatchOptions) -> list[DatabaseI
     if filled is not None and options.on_existing == "error":
         raise DatabaseError(
             f"{database}: image '{filled.name}' already has {filled.num_keypoints} keypoints and "
-            f"{filled.num_matches} matches: --on_existing append adds to them, replace removes "
-            "them; further videos need a new database with all videos"
+            f"{filled.num_matches} matches: --on_existing append adds to them, replace removes them"
         )
     if listed:
         check_no_camera(database, options.camera)

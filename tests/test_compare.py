@@ -341,11 +341,8 @@ def test_renderings_are_matched_by_name_or_order(tmp_path):
     assert [p.stem for p in match_renders(renders, references)] == [r.stem for r in references]
     (renders / "ground_truth").mkdir()
     (renders / "ground_truth" / references[1].name).touch()
-    with pytest.raises(EvaluationError, match="several"):
+    with pytest.raises(EvaluationError, match=references[1].stem):
         match_renders(renders, references)
-    in_folders = [tmp_path / folder / "0.png" for folder in ("a", "b")]
-    with pytest.raises(EvaluationError, match="several"):
-        match_renders(renders, in_folders)
 
 
 @pytest.mark.slow

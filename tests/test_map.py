@@ -121,7 +121,10 @@ def copying(model: Path, *sizes: int) -> Callable[..., tuple[int, ...]]:
 
     def mapped(_: Path, output: Path, *__: object, log: Path, **___: object) -> tuple[int, ...]:
         for number in range(len(sizes)):
-            shutil.copytree(model, output / str(number))
+            images = shutil.copytree(model, output / str(number)) / "images.bin"
+            # The images of the database are PNG files. The first image keeps a name that it lacks.
+            first, others = images.read_bytes().split(b".jpg\0", 1)
+            images.write_bytes(first + b".jpg\0" + others.replace(b".jpg\0", b".png\0"))
         log.touch()
         return sizes
 
@@ -172,7 +175,7 @@ def test_model_that_cannot_be_placed_keeps_the_coordinates_of_the_mapper(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The images of the distance are not registered, and those of the model are not readable."""
+    """An image of the distance is not registered, and one of the model is not readable."""
     mapped_model = made.output / "sparse" / "0"
     monkeypatch.setattr("colmap_av1.map.map_poses", copying(mapped_model, NUM_IMAGES))
     distance = PlaceOptions(scale="2=frame_000000.png,frame_000003.png")

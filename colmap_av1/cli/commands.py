@@ -40,7 +40,7 @@ from colmap_av1.options import (
     ViewOptions,
 )
 from colmap_av1.options.fields import Options
-from colmap_av1.util.files import REPORT
+from colmap_av1.util.files import output_of_model
 
 _FAILED_CHECK = 1
 # A trainer failed on a model.
@@ -381,10 +381,10 @@ def _view_page(namespace: argparse.Namespace) -> None:
 
     model, report = Path(namespace.model), None
     check_page(namespace.output, [model], overwrite=namespace.overwrite)
-    folder = model.resolve().parent.parent
-    if model.resolve() == folder / "sparse" / "0" and (folder / REPORT).exists():
+    output = output_of_model(model)
+    if output is not None and output == model.resolve().parents[1]:  # not of a further model
         try:
-            report = read_report(folder)
+            report = read_report(output)
         except ModelError as error:
             print_warning(f"{error}; the page shows only the model")
     if report is not None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
-from colmap_av1.images.files import READABLE, grey_within
+from colmap_av1.images.files import READABLE, grey_within, image_size
 from colmap_av1.images.names import (
     check_new_name,
     frames_of_images,
@@ -79,38 +79,47 @@ class ChosenImages:
         return ChosenImages([self.names[i] for i in index], self.frames[np.asarray(index, int)])
 
 
-def existing_images(folder: str | os.PathLike[str], options: ImageOptions) -> list[str]:
+def existing_images(
+    folder: str | os.PathLike[str], options: ImageOptions, size: tuple[int, int]
+) -> list[str]:
     """Images in a folder, unless an earlier run of this package wrote them.
 
-    An earlier run wrote them if frame 0 exists under the name that new images get, since other
-    programs count from 1; if the options choose frames by time, and all names are those of new
-    images; or if `frame_list` lists all of them and more.
+    An earlier run wrote them
+
+    - if frame 0 exists under the name that new images get: other programs count from 1;
+    - if the options choose frames by time, and all names are those of new images, but not numbered
+      from 1 without gaps;
+    - if `frame_list` lists all of them and more, and they have the size of new images.
 
     Args:
         folder: the folder; it need not exist.
         options: how images are chosen and named.
+        size: (width, height) of new images.
 
     Returns:
         File names in natural order; none if an earlier run wrote them.
 
     Raises:
-        ImageError: the list of frames cannot be read.
+        ImageError: the list of frames or an image cannot be read.
     """
     root = Path(folder)
     if not root.is_dir():
         return []
-    names = {
+    found = [
         p.name
         for p in root.iterdir()
         if p.suffix.lower() in READABLE and not p.name.startswith(".")
-    }
+    ]
+    names = sorted(found, key=natural_key)
     is_own = image_names(options.file_name, [0])[0] in names
     if options.fps is not None or options.num_images is not None:
         regex = pattern_regex(options.file_name)
-        is_own |= all(regex.fullmatch(name) for name in names)
-    if options.frame_list is not None:
-        is_own |= names < {name for *_, name in _read_entries(options.frame_list, options)}
-    return [] if is_own else sorted(names, key=natural_key)
+        are_new = all(regex.fullmatch(name) for name in names)
+        is_own |= are_new and names != image_names(options.file_name, range(1, len(names) + 1))
+    if options.frame_list is not None and names:
+        listed = {name for *_, name in _read_entries(options.frame_list, options)}
+        is_own |= {*names} < listed and image_size(root / names[0]) == size
+    return [] if is_own else names
 
 
 def choose_images(

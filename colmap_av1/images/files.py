@@ -353,7 +353,8 @@ def read_image(path: Path) -> _Image:
             f"{path}: cannot be read: {error.strerror}: fix that, or give other images"
         ) from error
     if image is None:
-        raise ImageError(f"{path}: is missing or not an image: give the folder of the images")
+        what = "is not an image that OpenCV reads" if data else "is missing or empty"
+        raise ImageError(f"{path}: {what}: give the folder of the images")
     return np.asarray(image, dtype=np.uint8)
 
 

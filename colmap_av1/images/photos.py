@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -132,8 +131,10 @@ def read_photos(folder: Path, files: Sequence[Path], label: str, *, flat: bool) 
         names[key] = file
         size = image_size(path)
         bitmap = pycolmap.Bitmap.read(path, as_rgb=False)
-        if bitmap is None or _is_damaged(path):
+        if bitmap is None or _is_cut_short(path):
             raise ImageError(f"{path}: is damaged: copy it again, or remove it")
+        if path.suffix.lower() not in {".jpg", ".jpeg"}:  # slower, and other photos are rare
+            read_image(path)
         camera, focal_length = bitmap.exif_camera_model() or "", bitmap.exif_focal_length()
         place = _place_of(bitmap)
         photos.append(Photo(path, name, size, camera, focal_length, place, file_state(path)))
@@ -148,17 +149,11 @@ def _place_of(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
     return float(latitude), float(longitude), float(bitmap.exif_altitude() or 0)
 
 
-def _is_damaged(path: Path) -> bool:
-    """Whether a photo cannot be decoded as a whole.
-
-    A truncated JPEG file is found without decoding; decoders would fill the missing part with grey.
-    """
+def _is_cut_short(path: Path) -> bool:
+    """Whether a JPEG file is truncated; decoders would fill the missing part with grey."""
     with path.open("rb") as file:
         if file.read(len(_START_OF_IMAGE)) != _START_OF_IMAGE:
-            with suppress(ImageError):
-                read_image(path)
-                return False
-            return True
+            return False
         data = file.read()
     # Segments are skipped by their lengths because one may hold a thumbnail, which has the same
     # markers. What follows the image, such as the video of a motion photo, is not read.

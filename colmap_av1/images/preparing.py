@@ -202,7 +202,7 @@ def _fit(
     display, video_size = video.display, video.picture_size
     existing = dict(listed)
     if folder is not None and not existing:
-        names = existing_images(folder, options)
+        names = existing_images(folder, options, video_size)
         existing = {name: image_size(folder / name) for name in names}
     back = _way_back(video, existing, folder)
     if back is not None:

@@ -12,13 +12,14 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.names import natural_order
 from colmap_av1.matching.gaps import Gap
 from colmap_av1.matching.image_matches import MatchedImages, used_pairs
+from colmap_av1.util.grouping import sums_beside_gaps
 
 # A gap has few matches if they are fewer than this share of the usual number. Camera jerks leave 5
 # to 37 %, clips without jerks have 53 % and more, with matches from motion or from SIFT. Models
 # that COLMAP's mappers bent at a jerk by 0.7 to 1 % of their extent had 5 to 25 %.
 _FEW = 0.4
-# A folder has no gaps if its images have at least this share of their matches with images of other
-# folders, which hold them together: photos of a scene that a video shows, for example.
+# There is no gap if the images near it have this share of their matches or more with images of
+# other folders, which hold them together: photos of a scene that a video shows, for example.
 _SHARED = 0.3
 # The usual number comes from up to this many gaps before and after.
 _NEARBY = 10
@@ -57,20 +58,21 @@ def few_match_gaps(
     np.add.at(change, ends[:, 0], num_inliers[inside])
     np.subtract.at(change, ends[:, 1], num_inliers[inside])
     across = np.cumsum(change)
-    row_of, count = row[pairs].ravel(), np.repeat(num_inliers, 2)
-    outside = np.bincount(row_of, count * np.repeat(~inside, 2), minlength=len(rows))
-    is_shared = outside >= _SHARED * np.bincount(row_of, count, minlength=len(rows))
+    image, count = rank[pairs].ravel(), np.repeat(num_inliers, 2)
+    every = np.bincount(image, count, minlength=len(names))
+    outside = np.bincount(image, count * np.repeat(~inside, 2), minlength=len(names))
     found: list[Gap] = []
-    for own, is_held in zip(rows.values(), is_shared.tolist(), strict=True):
-        if is_held:
-            continue
-        share = _share_of_usual(across[rank[own[0]] : rank[own[-1]]])
+    for own in rows.values():
+        first, last = rank[own[0]], rank[own[-1]]
+        share = _share_of_usual(across[first:last])
+        beside = [sums_beside_gaps(n[first : last + 1], _NEARBY) for n in (outside, every)]
+        share[beside[0] >= _SHARED * beside[1]] = 1.0
         for is_few, gaps in groupby(range(len(share)), key=lambda g: share[g] < _FEW):
             if is_few:
                 together = list(gaps)
-                first, last = own[together[0]], own[together[-1] + 1]
+                before, after = names[own[together[0]]], names[own[together[-1] + 1]]
                 least = float(share[together].min())
-                found.append(Gap(names[first], names[last], ("few tracks",), share=least))
+                found.append(Gap(before, after, ("few tracks",), share=least))
     return tuple(found)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,6 +147,7 @@ class LongRangeCheck:
         self._pairs, self._angles = _far_pairs(images, self._cameras, points_of)
         self.wanted: list[int] = np.unique(self._pairs).tolist()
         self._features: dict[int, Features] = {}
+        self._num_features: list[int] = []  # before masking
 
     def add(self, index: int, picture: _Image, mask: Mask | None = None) -> None:
         """Extract features from the picture of an image.
@@ -156,6 +158,7 @@ class LongRangeCheck:
             mask: which pixels are used; None for all.
         """
         features = extract_features(picture, _NUM_FEATURES)
+        self._num_features.append(len(features.xy))
         self._features[index] = masked_features(features, picture, mask)
 
     def result(self) -> LongRangeErrors:
@@ -178,7 +181,7 @@ class LongRangeCheck:
             if len(error):
                 names.append((self._images[i].name, self._images[j].name))
                 errors.append(float(np.median(error)))
-        num_features = int(np.median([len(own.xy) for own in features.values()] or [0]))
+        num_features = int(np.median(self._num_features or [0]))
         should_match = (self._angles <= _SHARP_ANGLE) | (num_features < _SHARP_FEATURES)
         return LongRangeErrors(
             tuple(names),
@@ -245,10 +248,16 @@ def model_long_range_errors(
     return check.result()
 
 
-def _near_points(positions: Sequence[_Floats], size: tuple[int, int]) -> Mask:
-    """The pixels near the positions of points in an image of this (width, height)."""
+def _near_points(positions: Sequence[_Floats], size: tuple[int, int]) -> Mask | None:
+    """The pixels near the positions of points in an image of this (width, height).
+
+    None without points. If there are few, the distance is that at which they would cover the image.
+    """
+    if not positions:
+        return None
     kept = np.zeros(size[::-1], np.uint8)
-    radius = round(_POINT_DISTANCE * max(size))
+    covering = math.sqrt(size[0] * size[1] / (math.pi * len(positions)))
+    radius = round(max(_POINT_DISTANCE * max(size), covering))
     for xy in positions:
         cv2.circle(kept, np.round(xy).astype(int).tolist(), radius, 1, thickness=cv2.FILLED)
     return make_mask(kept > 0)

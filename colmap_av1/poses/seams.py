@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.names import natural_key, natural_order, videos_of
+from colmap_av1.util.grouping import sums_beside_gaps
 
 # Points with fewer views are ignored: two views do not constrain the scale between images.
 _FEWEST_VIEWS = 3
@@ -32,8 +33,8 @@ _ENOUGH = 100
 # A seam with few points is not disconnected if this share of the median number of points have views
 # before and after it, however far apart: the parts of a cut video may see the same place elsewhere.
 _ELSEWHERE = 0.5
-# If the images of other folders see at least this share of the points of a folder's images, they
-# hold these images together: photos of a scene that a video shows, for example.
+# If the images of other folders see more than this share of the points near a seam, they hold its
+# images together: photos of a scene that a video shows, for example.
 _SHARED = 0.5
 # A point has depth if its parallax exceeds this many pixels, several times the error of an
 # observation.
@@ -52,7 +53,7 @@ _DEEP = 100
 class Seams:
     """The points at each seam: between neighbours in time of the same camera and folder.
 
-    Folders whose images are held together by those of others have no seams, see `_SHARED`. Only
+    Images that are held together by those of other folders have no seams, see `_SHARED`. Only
     points with at least three views count. A model may be bent at seams of these kinds:
 
     - `doubtful`: far fewer points than usual connect the sides;
@@ -189,11 +190,11 @@ def model_seams(
     num_images, num_seams = len(images), max(len(images) - 1, 0)
     is_inside = np.isin(np.arange(num_seams), neighbours)
     sequence = np.cumsum(np.append(True, ~is_inside)) if num_images else np.empty(0, np.int64)
-    shared = _shared_points(sequence[views], point, num_sequences=int(sequence.max(initial=0)) + 1)
+    is_held = _are_held_by_others(sequence, views, point)
     seams = [
         k
         for k in neighbours
-        if shared[sequence[k]] < _SHARED and not {images[k].name, images[k + 1].name} & {*photos}
+        if not is_held[k] and not {images[k].name, images[k + 1].name} & {*photos}
     ]
     is_seam = np.isin(np.arange(num_seams), seams)
     is_near = (np.diff(point) == 0) & (np.diff(views) <= _REACH)
@@ -243,23 +244,29 @@ def model_seams(
     )
 
 
-def _shared_points(
-    sequence: NDArray[np.int64], point: NDArray[np.int64], *, num_sequences: int
-) -> NDArray[np.float64]:
-    """The share of the points of each sequence that other sequences see, too.
+def _are_held_by_others(
+    sequence: NDArray[np.int64], views: NDArray[np.int64], point: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Whether most points near each seam are seen by images of other sequences, too.
 
     Args:
-        sequence: int64 [n] sequence of each view.
+        sequence: int64 [num_images] sequence of each image, ascending.
+        views: int64 [n] image of each view.
         point: int64 [n] its point.
-        num_sequences: number of sequences; some may have no views.
 
     Returns:
-        float64 [num_sequences].
+        bool [num_images - 1]; false between images of different sequences.
     """
-    seen, seen_in = np.divmod(np.unique(point * num_sequences + sequence), num_sequences)
-    others = (np.bincount(seen) > 1)[seen]
-    count = np.bincount(seen_in, minlength=num_sequences)
-    return np.bincount(seen_in, others, minlength=num_sequences) / np.maximum(count, 1)
+    num_images = len(sequence)
+    seen = np.unique(np.column_stack([point, sequence[views]]), axis=0)[:, 0]
+    is_shared = np.bincount(seen, minlength=int(point.max(initial=-1)) + 1)[point] > 1
+    shared = np.bincount(views, is_shared, minlength=num_images)
+    every = np.bincount(views, minlength=num_images)
+    held = np.zeros(max(num_images - 1, 0), np.bool_)
+    for own in np.split(np.arange(num_images), np.flatnonzero(np.diff(sequence)) + 1):
+        beside = [sums_beside_gaps(n[own], _REACH) for n in (shared, every)]
+        held[own[:-1]] = beside[0] > _SHARED * beside[1]
+    return held
 
 
 def images_in_time(images: Sequence[ModelImage]) -> tuple[list[ModelImage], list[int]]:

@@ -225,10 +225,13 @@ def remove_gaussians_in(folder: Path) -> None:
         try:
             with path.open("rb") as file:
                 is_own = f"\n{_MADE_BY}\n".encode() in file.read(_HEADER_START)
-            if is_own:
+        except OSError:  # not a file of this package
+            continue
+        if is_own:
+            try:
                 path.unlink()
-        except OSError as error:
-            raise WriteError(cannot_write(path, error)) from error
+            except OSError as error:
+                raise WriteError(cannot_write(path, error)) from error
 
 
 def write_model_gaussians(path: Path, model: Path) -> None:

@@ -50,7 +50,9 @@ def digest_if_there(path: str | os.PathLike[str] | None) -> str | None:
 
 
 def digest_of_tree(path: str | os.PathLike[str] | None) -> list[tuple[str, str]]:
-    """Paths and digests of a file, or of all files in a folder; none if it is missing or None.
+    """Path and digest of a file, or of all files in a folder that are not hidden.
+
+    There are none if it is missing or None.
 
     Raises:
         OSError: a file cannot be read.
@@ -58,8 +60,14 @@ def digest_of_tree(path: str | os.PathLike[str] | None) -> list[tuple[str, str]]
     if path is None:
         return []
     root = Path(path)
-    files = [root] if root.is_file() else sorted(p for p in root.rglob("*") if p.is_file())
-    return [(file.relative_to(root).as_posix(), file_digest(file)) for file in files]
+    if root.is_file():
+        return [("", file_digest(root))]
+    files = {p.relative_to(root): p for p in root.rglob("*") if p.is_file()}
+    return [
+        (name.as_posix(), file_digest(files[name]))
+        for name in sorted(files)
+        if not any(part.startswith(".") for part in name.parts)
+    ]
 
 
 @functools.cache

@@ -36,6 +36,19 @@ REPORT = "report.json"
 _OURS = f"colmap-av1-{zlib.crc32(socket.gethostname().encode()) & 0xFFFF:04x}"
 
 
+def output_of_model(model: Path) -> Path | None:
+    """The output of `reconstruct` that a model belongs to; None if another program made it.
+
+    The report of a further model, in OUTPUT/model_1/sparse/0, is in OUTPUT.
+    """
+    folder = model.resolve()
+    if folder.parts[-2:] != ("sparse", "0"):
+        return None
+    own = folder.parents[1]
+    outputs = [own, own.parent] if own.name.startswith("model_") else [own]
+    return next((output for output in outputs if (output / REPORT).is_file()), None)
+
+
 def check_new_file(
     path: Path, inputs: Iterable[_Path | None] = (), *, overwrite: bool = False
 ) -> None:

@@ -26,3 +26,20 @@ def grouped(
     bounds = np.zeros(num_groups + 1, np.int64)
     np.cumsum(np.bincount(key, minlength=num_groups), out=bounds[1:])
     return order, bounds
+
+
+def sums_beside_gaps(values: NDArray[Any], reach: int) -> NDArray[Any]:
+    """For each gap between neighbours, the sum of up to `reach` values on either side.
+
+    Args:
+        values: [n] the values.
+        reach: largest number of values on each side.
+
+    Returns:
+        [n - 1].
+    """
+    after = np.arange(1, len(values))
+    total = np.append(0, np.cumsum(values))
+    return np.asarray(
+        total[np.minimum(after + reach, len(values))] - total[np.maximum(after - reach, 0)]
+    )

@@ -239,13 +239,15 @@ class VideoStream:
             raise VideoError(f"{self.file}: has no frames: give another video")
 
 
-def missing_end(file: VideoFile, count: int, last: Any) -> str | None:
+def missing_end(file: VideoFile, count: int, last: Any, last_pts: int | None = None) -> str | None:
     """Describe how a file is cut off that the demuxer treats as complete; None if it is whole.
 
     Args:
         file: the file.
         count: number of packets of its video stream.
         last: the last packet, of PyAV; None without packets.
+        last_pts: the largest presentation time of all packets in units of the time base, if it may
+            be that of another packet; None: that of the last one.
     """
     if 0 < count < (file.num_packets or 0) and "mp4" in file.container:
         return f"cut off after {count} of {file.num_packets} packets"
@@ -265,10 +267,11 @@ def missing_end(file: VideoFile, count: int, last: Any) -> str | None:
             return f"cut off after packet {count}"
     if "mp4" in file.container and is_fragmented_mp4_cut(file.path):
         return f"cut off after packet {count}"
-    if "matroska" in file.container and file.duration and last.pts is not None:
+    last_pts = last.pts if last_pts is None else last_pts
+    if "matroska" in file.container and file.duration and last_pts is not None:
         step = 1 / file.frame_rate if file.frame_rate else 0.0
         length = float((last.duration or 0) * last.time_base)
-        end_time = float(last.pts * last.time_base) + max(length, step)
+        end_time = float(last_pts * last.time_base) + max(length, step)
         if end_time + 1.5 * step < file.duration:
             return f"cut off after {end_time:.2f} of {file.duration:.2f} seconds"
     return None

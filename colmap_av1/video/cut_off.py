@@ -98,8 +98,8 @@ def is_fragmented_mp4_cut(path: Path) -> bool:
 
 def is_mp4_without_index(path: Path) -> bool:
     """Whether an MP4 file ends before the box that lists its samples, which cameras write last."""
-    names = [name for name, _ in _boxes(path)]
-    return names[:1] == [b"ftyp"] and b"moov" not in names
+    names = {name for name, _ in _boxes(path)}
+    return b"mdat" in names and not names & {b"moov", b"meta"}
 
 
 def _boxes(path: Path) -> Iterator[tuple[bytes, int | None]]:

@@ -202,10 +202,13 @@ def counted(file: _File) -> tuple[_File, str | None]:
     """
     if file.num_packets is not None:
         return file, None
-    count, last = 0, None
+    count, last, last_pts = 0, None, None
     for packet in _packets_before_damage(file):
         count, last = count + 1, packet
-    return dataclasses.replace(file, num_packets=count), missing_end(file, count, last)
+        if packet.pts is not None and (last_pts is None or packet.pts > last_pts):
+            last_pts = packet.pts
+    damage = missing_end(file, count, last, last_pts)
+    return dataclasses.replace(file, num_packets=count), damage
 
 
 def count_shown(video: Video) -> int:

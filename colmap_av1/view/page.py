@@ -20,7 +20,7 @@ from colmap_av1.geometry.coverage import PosedCamera, coverage
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file
 from colmap_av1.util.digests import package_version
-from colmap_av1.util.files import check_new_file, whole_file
+from colmap_av1.util.files import check_new_file, output_of_model, whole_file
 from colmap_av1.util.pages import render_page
 from colmap_av1.util.spread import evenly_spread
 from colmap_av1.view.scene import Scene, normalised, read_scene
@@ -430,15 +430,14 @@ def _gap_in_words(gap: Gap) -> str:
 
 def _commands(model: Path) -> list[tuple[str, str]]:
     """Suggestions for the next step: a description and a command each."""
-    folder = model.resolve().parent.parent
-    if model.resolve() != folder / "sparse" / "0" or not (folder / "images").is_dir():
+    if output_of_model(model) is None:
         command = ["colmap-av1", "densify", "--model", str(model), "--video", "VIDEO"]
         return [("Add dense points from the video", shlex.join([*command, "--output", "OUTPUT"]))]
-    name = shlex.quote(str(folder))
+    folder = shlex.quote(str(model.resolve().parents[1]))
     return [
-        ("Train with Brush", f"brush {name} --with-viewer"),
+        ("Train with Brush", f"brush {folder} --with-viewer"),
         (
             "Train with nerfstudio",
-            f"ns-train splatfacto --data {name} colmap --colmap-path sparse/0",
+            f"ns-train splatfacto --data {folder} colmap --colmap-path sparse/0",
         ),
     ]

@@ -133,3 +133,22 @@ def test_cells_without_a_ray_are_not_counted(camera: pycolmap.Camera) -> None:
     assert len(view.project(own)[0]) == len(own)
     masked = PosedCamera(camera, HERE, make_mask(np.ones(SIZE[::-1], np.bool_)))
     assert coverage([view], own) == coverage([masked], own) == 1.0
+
+
+@pytest.mark.parametrize("focal_length", [400.0, 600.0])
+def test_distortion_does_not_fold_points_into_the_image(focal_length: float) -> None:
+    """With the shorter focal length, even the edge of the image has no rays."""
+    lens = pycolmap.Camera(
+        camera_id=1,
+        model="SIMPLE_RADIAL",
+        width=640,
+        height=480,
+        params=[focal_length, 320, 240, -0.25],
+    )
+    view = PosedCamera(lens, HERE)
+    own = np.column_stack([np.linspace(0, 6, 200), np.zeros(200), np.ones(200)])
+    xy = np.asarray(lens.img_from_cam(own)).reshape(-1, 2)
+    inside = (xy[:, 0] >= 0) & (xy[:, 0] < 640)
+    seen = view.sees(own, xy)
+    assert (inside & ~seen).any()
+    assert np.flatnonzero(inside & seen).tolist() == view.project(own)[0].tolist()

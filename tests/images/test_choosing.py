@@ -389,3 +389,17 @@ def test_missing_images_of_an_earlier_run_are_written_again(
         again = match(f"{number}.db", clip, image_path="images", options=options)
         assert (again.num_images, again.num_written_images) == (len(names), num_missing)
     assert sorted(path.name for path in Path("images").iterdir()) == names
+
+
+def test_images_that_another_program_numbered_from_1_are_not_of_an_earlier_run(
+    clip: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    ffmpeg("-i", clip, "-vf", "fps=5", folder / "frame_%06d.png")
+    before = sorted(folder.iterdir())
+    for choice in (ImageOptions(fps=5), ImageOptions(num_images=3)):
+        with pytest.raises(OptionError, match="exist"):
+            match(tmp_path / "a.db", clip, image_path=folder, options=replace(DENSE, images=choice))
+    assert sorted(folder.iterdir()) == before
+    assert match(tmp_path / "a.db", clip, image_path=folder, options=DENSE).num_images > 2

@@ -52,21 +52,24 @@ def test_gaps_with_few_matches_are_found() -> None:
     assert few_match_gaps(*chain({9: 0.0}), names, rows) == ()
 
 
-def test_images_held_together_by_those_of_another_folder_have_no_gaps() -> None:
-    """A few photos of a scene that a video shows are matched with its images."""
+@pytest.mark.parametrize(
+    ("num_links", "linked", "num_gaps"), [(1, 0, 1), (5000, 0, 0), (5000, 20, 1)]
+)
+def test_images_held_together_by_those_of_another_folder_have_no_gaps(
+    num_links: int, linked: int, num_gaps: int
+) -> None:
+    """Photos are matched with images of a video. Links far from the gap do not count."""
     names = names_of("video/") + names_of("photos/")
-    rows = [name.split("/")[0] for name in names]
     pairs, count = chain({})
     own, few = chain({9: 0.1})
-    links = np.column_stack([np.arange(NUM_IMAGES), np.arange(NUM_IMAGES) + NUM_IMAGES])
-    for num_links, num_gaps in ((1, 1), (5000, 0)):
-        found = few_match_gaps(
-            np.concatenate([pairs, own + NUM_IMAGES, links]),
-            np.concatenate([count, few, np.full(NUM_IMAGES, num_links)]),
-            names,
-            rows,
-        )
-        assert len(found) == num_gaps
+    links = np.column_stack([np.arange(NUM_IMAGES), np.arange(NUM_IMAGES) + NUM_IMAGES])[linked:]
+    found = few_match_gaps(
+        np.concatenate([pairs, own + NUM_IMAGES, links]),
+        np.concatenate([count, few, np.full(len(links), num_links)]),
+        names,
+        [name.split("/")[0] for name in names],
+    )
+    assert len(found) == num_gaps
 
 
 def test_warning_names_gaps_and_the_smallest_share() -> None:

@@ -157,7 +157,7 @@ def test_error_of_a_requested_joint_estimate_says_what_to_do(
     options = replace(OPTIONS, verify=VerifyOptions(verify="joint"))
     with pytest.raises(ModelError, match="--verify") as raised:
         match(tmp_path / "a.db", scene, image_path=joint.image_path, options=options)
-    assert "log" not in str(raised.value)
+    assert "mapper.log" not in str(raised.value)
 
 
 def test_matches_of_a_doubtful_joint_estimate_are_kept_with_a_warning(

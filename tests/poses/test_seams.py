@@ -115,21 +115,26 @@ def test_photos_are_no_neighbours_in_time(tmp_path: Path) -> None:
 
 
 def test_images_held_together_by_those_of_another_folder_have_no_seams(tmp_path: Path) -> None:
-    def seams_with(more: list[list[int]]) -> Seams:
-        """Seams of a video of 20 images and 10 photos, whose points are also seen by the video."""
-        video = [[k, k + 1, k + 2] for k in range(18) for _ in range(100)]
-        photos = [[k, k - 10, k - 9] for k in range(20, 30) for _ in range(30)]
-        write_row(tmp_path, video + photos + more, 0)
+    def seams_with(views: list[list[int]]) -> Seams:
+        """Seams of a video of 20 images and of 10 photos."""
+        write_row(tmp_path, views, 0)
         model = read_model(tmp_path)
         for image in model.images.values():
-            folder = "video" if int(Path(image.name).stem) < 20 else "photos"
+            folder = "film" if int(Path(image.name).stem) < 20 else "photos"
             image.name = f"{folder}/{image.name}"
         return seams_of(model)
 
-    assert len(seams_with([]).num_points) == 19
-    assert seams_with([]).disconnected == []
+    video = [[k, k + 1, k + 2] for k in range(18) for _ in range(100)]
+    photos = [[k, k - 10, k - 9] for k in range(20, 30) for _ in range(30)]
+    assert len(seams_with(video + photos).num_points) == 19
+    assert seams_with(video + photos).disconnected == []
     # With points of their own, these images are a second video.
-    assert len(seams_with([[k, k + 1, k + 2] for k in (20, 26)] * 500).num_points) == 28
+    second = [[k, k + 1, k + 2] for k in (20, 26)] * 500
+    assert len(seams_with(video + photos + second).num_points) == 28
+    # A break in the video is found although photos show another part of it.
+    broken = [views for views in video if not views[0] <= 4 < views[2]]
+    many = [[k, k - 1, k - 10] for k in range(25, 30) for _ in range(300)]
+    assert 4 in seams_with(broken + many).disconnected
 
 
 def test_models_without_points_have_empty_seams(tmp_path: Path) -> None:

@@ -22,7 +22,6 @@ from colmap_av1.geometry.triangulation import (
 )
 from colmap_av1.options import TriangulateOptions
 from colmap_av1.splats.cloud import splat_cloud
-from colmap_av1.splats.ray_search import _seen_at
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 CAMERA = pycolmap.Camera(
@@ -198,21 +197,6 @@ def test_pixels_without_a_ray_get_no_points(model: str, params: list[float]) -> 
     assert np.isfinite(made.xyz).all()
     assert (np.diff(made.offsets) >= 1).all()
     assert coverage(views, made.xyz) > 0.95
-
-
-def test_rays_outside_the_field_of_view_have_no_projection() -> None:
-    """The distortion would project some of them into the image."""
-    lens = pycolmap.Camera(
-        camera_id=1, model="SIMPLE_RADIAL", width=640, height=480, params=[400, 320, 240, -0.25]
-    )
-    one, two = (PosedCamera(lens, np.eye(3, 4)) for _ in range(2))
-    slopes = np.linspace(0, 6, 200)
-    rays = np.column_stack([slopes, np.zeros(200), np.ones(200)])
-    found = _seen_at(one, two, rays, np.array([[0.5]]))[:, 0]
-    seen, _, _ = two.project(rays)
-    inside = (found[:, 0] >= 0) & (found[:, 0] < 640)
-    assert np.flatnonzero(inside).tolist() == seen.tolist()
-    assert 0 < len(seen) < 100
 
 
 def test_point_behind_a_filled_hole_leaves_no_hole() -> None:

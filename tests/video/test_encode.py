@@ -398,9 +398,14 @@ def test_video_whose_end_is_missing_is_used_with_a_warning(
     with pytest.raises(BitstreamError, match="cut off"):
         encode_video(video, tmp_path / "strict.mp4", strict=True)
     assert not (tmp_path / "strict.mp4").exists()
+    # The last packet in coding order is not the last picture.
+    slower = "setpts='if(gt(N,9),N*8,N)/25/TB'"
+    varying = ["-i", phone, "-vf", slower, "-fps_mode", "vfr", "-c:v", "libx264", "-bf", "3"]
+    reordered = ffmpeg(*varying, tmp_path / "reordered.mkv")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        encode_video(whole, tmp_path / "whole.mp4", strict=True)
+        for complete in (whole, reordered):
+            encode_video(complete, tmp_path / f"{complete.stem}.mp4", strict=True)
 
 
 def test_frames_are_counted_if_the_container_does_not_store_their_number(

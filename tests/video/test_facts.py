@@ -186,14 +186,7 @@ def test_default_or_largest_stream_is_read(clip: Path, ffmpeg: Ffmpeg, tmp_path:
     two = [
         "-i",
         clip,
-        "-map",
-        "0:v",
-        "-map",
-        "0:v",
-        "-c:v",
-        "libx264",
-        "-filter:v:0",
-        "scale=96:-2",
+        *["-map", "0:v", "-map", "0:v", "-c:v", "libx264", "-filter:v:0", "scale=96:-2"],
     ]
     for number, size in (("0", (96, 64)), ("1", (192, 128))):
         of_all = ["-disposition:v", "0", f"-disposition:v:{number}", "default"]

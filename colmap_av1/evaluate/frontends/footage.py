@@ -114,7 +114,9 @@ def choose_footage(
         options.verify,
     )
     # A folder that is not given only holds images that this stage wrote.
-    existing = existing_images(images, options.images) if image_path is not None else []
+    existing = list[str]()
+    if image_path is not None:
+        existing = existing_images(images, options.images, video.picture_size)
     depends_on = [
         file_digest(video.path),
         given,

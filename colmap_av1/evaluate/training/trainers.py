@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -177,6 +177,12 @@ def train(
     inputs = [p for part in ("sparse/0", "images") for p in (split.whole / part).rglob("*")]
     given = [file_digest(path) for path in sorted(inputs) if path.is_file()]
     names = [reference.name for reference in references]
+    twice = _repeated(reference.stem for reference in references)
+    if twice is not None:
+        raise EvaluationError(
+            f"several test images are named '{twice}', and renderings are matched by name: give "
+            "images of different names"
+        )
     stops = tuple(sorted({stop for stop in milestones if stop < iterations}))
     stops = (*stops, iterations) if trainer == GSPLAT or "{milestones}" in trainer else ()
 
@@ -243,20 +249,13 @@ def match_renders(folder: Path, references: Sequence[Path]) -> list[Path]:
     Folders and extensions do not count.
 
     Raises:
-        EvaluationError: the folder does not have a rendering of each reference, or names are not
-            unique.
+        EvaluationError: the folder does not have a rendering of each reference, or several
+            renderings have the name of one.
     """
     found = [p for p in folder.rglob("*") if p.suffix.lower() in _PICTURES]
     by_stem = {path.stem: path for path in found}
     wanted = [reference.stem for reference in references]
-    twice = next((s for s, n in Counter(wanted).items() if n > 1), None)
-    if twice is not None:
-        raise EvaluationError(
-            f"several test images are named '{twice}', and renderings are matched by name: give "
-            "images of different names"
-        )
-    stems = Counter(path.stem for path in found)
-    twice = next((stem for stem in wanted if stems[stem] > 1), None)
+    twice = _repeated(path.stem for path in found if path.stem in wanted)
     if twice is not None:
         raise EvaluationError(
             f"{folder}: has several pictures named '{twice}': let the trainer's command write only "
@@ -270,6 +269,11 @@ def match_renders(folder: Path, references: Sequence[Path]) -> list[Path]:
         f"{folder}: has {len(found)} renderings for {len(references)} test images: let the "
         "trainer's command write one for each into {renders}"
     )
+
+
+def _repeated(names: Iterable[str]) -> str | None:
+    """A name that occurs more than once; None if there is none."""
+    return next((name for name, count in Counter(names).items() if count > 1), None)
 
 
 def _states(renders: Path, stops: Sequence[int], references: Sequence[Path]) -> list[Milestone]:
