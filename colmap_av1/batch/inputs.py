@@ -29,6 +29,7 @@ VIDEO_SUFFIXES = (
     ".m4v",
     ".mov",
     ".3gp",
+    ".3g2",
     ".mkv",
     ".webm",
     ".ivf",
@@ -41,6 +42,14 @@ VIDEO_SUFFIXES = (
     ".mts",
     ".mpg",
     ".mpeg",
+    ".mxf",
+    ".vob",
+    ".ogv",
+    ".h264",
+    ".264",
+    ".hevc",
+    ".h265",
+    ".265",
     ".y4m",
 )
 _SPECIAL = frozenset("*?[")

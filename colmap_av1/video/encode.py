@@ -197,7 +197,7 @@ def _encode(
             raise VideoError(
                 f"{path}: no frame can be decoded, the file is damaged: give another copy"
             )
-        _check_stream(partial, count)
+        _check_stream(path, partial, count)
         return count
 
     try:
@@ -390,11 +390,13 @@ def _warn_of_damage(video: VideoFile, readable: int, reason: str) -> None:
     )
 
 
-def _check_stream(stream: Path, count: int) -> None:
-    """Raise an error if a stream does not have the number of frames that ffmpeg reported."""
+def _check_stream(video: Path, stream: Path, count: int) -> None:
+    """Raise an error if the stream of a video lacks frames that ffmpeg reported."""
     found = _count_packets(stream)
     if found != count:
-        raise EncodeError(f"the encoder wrote {found} of {count} frames: try another --encoder")
+        raise EncodeError(
+            f"{video}: the encoder wrote {found} of {count} frames: try another --encoder"
+        )
 
 
 def _count_packets(stream: Path) -> int:
