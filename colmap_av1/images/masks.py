@@ -19,6 +19,7 @@ from colmap_av1.images.files import READABLE
 from colmap_av1.images.names import natural_key, pattern_regex
 from colmap_av1.options.images import ImageOptions
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.files import is_hidden
 from colmap_av1.util.threads import map_on_threads
 
 _SUFFIX = ".png"
@@ -224,9 +225,7 @@ def read_masks(
         files = [path]
     elif path.is_dir():
         found = (p for p in path.rglob("*") if p.suffix.lower() == _SUFFIX and p.is_file())
-        visible = [
-            p for p in found if not any(n.startswith(".") for n in p.relative_to(path).parts)
-        ]
+        visible = [p for p in found if not is_hidden(p.relative_to(path))]
         files = sorted(visible, key=lambda p: natural_key(p.relative_to(path).as_posix()))
         if not files:
             raise ImageError(f"{path}: holds no PNG: {_LAYOUTS}")

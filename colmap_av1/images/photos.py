@@ -133,7 +133,7 @@ def read_photos(folder: Path, files: Sequence[Path], label: str, *, flat: bool) 
         bitmap = pycolmap.Bitmap.read(path, as_rgb=False)
         if bitmap is None or _is_cut_short(path):
             raise ImageError(f"{path}: is damaged: copy it again, or remove it")
-        if path.suffix.lower() not in {".jpg", ".jpeg"}:  # slower, and other photos are rare
+        if path.suffix.lower() not in {".jpg", ".jpeg"}:  # which are checked without decoding
             read_image(path)
         camera, focal_length = bitmap.exif_camera_model() or "", bitmap.exif_focal_length()
         place = _place_of(bitmap)

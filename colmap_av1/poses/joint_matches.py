@@ -173,11 +173,11 @@ def match_jointly(
     if first.adjusted.seams_warning is not None:
         warnings.append(first.adjusted.seams_warning)
     matches = posed.matches.result
-    registered = {image.name for image in first.placed.images}
+    in_first = {image.name for image in first.placed.images}
     focal = [
         camera.mean_focal_length()
         for camera, name in zip(cameras, image_set.images.names, strict=True)
-        if name in registered
+        if name in in_first
     ]
     return JointMatches(
         cameras=cameras,

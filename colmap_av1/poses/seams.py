@@ -191,11 +191,8 @@ def model_seams(
     is_inside = np.isin(np.arange(num_seams), neighbours)
     sequence = np.cumsum(np.append(True, ~is_inside)) if num_images else np.empty(0, np.int64)
     is_held = _are_held_by_others(sequence, views, point)
-    seams = [
-        k
-        for k in neighbours
-        if not is_held[k] and not {images[k].name, images[k + 1].name} & {*photos}
-    ]
+    is_photo = [image.name in photos for image in images]
+    seams = [k for k in neighbours if not (is_held[k] or is_photo[k] or is_photo[k + 1])]
     is_seam = np.isin(np.arange(num_seams), seams)
     is_near = (np.diff(point) == 0) & (np.diff(views) <= _REACH)
     near = np.flatnonzero(is_near & (np.diff(sequence[views]) == 0))

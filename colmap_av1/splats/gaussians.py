@@ -221,17 +221,20 @@ def remove_gaussians_in(folder: Path) -> None:
     Raises:
         WriteError: a file cannot be removed.
     """
-    for path in sorted(folder.glob("*.ply")):
+    for path in filter(_is_own, sorted(folder.glob("*.ply"))):
         try:
-            with path.open("rb") as file:
-                is_own = f"\n{_MADE_BY}\n".encode() in file.read(_HEADER_START)
-        except OSError:  # not a file of this package
-            continue
-        if is_own:
-            try:
-                path.unlink()
-            except OSError as error:
-                raise WriteError(cannot_write(path, error)) from error
+            path.unlink()
+        except OSError as error:
+            raise WriteError(cannot_write(path, error)) from error
+
+
+def _is_own(path: Path) -> bool:
+    """Whether `write_gaussians` wrote a file."""
+    try:
+        with path.open("rb") as file:
+            return f"\n{_MADE_BY}\n".encode() in file.read(_HEADER_START)
+    except OSError:  # a folder, or unreadable
+        return False
 
 
 def write_model_gaussians(path: Path, model: Path) -> None:

@@ -14,6 +14,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from colmap_av1.util.files import is_hidden
+
 PACKAGE = Path(__file__).resolve().parents[1]
 # Option fields that change only the run time, not the result. The threads of a mapper are not among
 # them, because they change the last digits of the result.
@@ -64,9 +66,7 @@ def digest_of_tree(path: str | os.PathLike[str] | None) -> list[tuple[str, str]]
         return [("", file_digest(root))]
     files = {p.relative_to(root): p for p in root.rglob("*") if p.is_file()}
     return [
-        (name.as_posix(), file_digest(files[name]))
-        for name in sorted(files)
-        if not any(part.startswith(".") for part in name.parts)
+        (name.as_posix(), file_digest(files[name])) for name in sorted(files) if not is_hidden(name)
     ]
 
 

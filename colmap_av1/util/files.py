@@ -17,7 +17,7 @@ import socket
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.signals import held_back
@@ -34,6 +34,11 @@ REPORT = "report.json"
 # Locks of some cluster file systems are visible on one machine only, so each machine removes only
 # its own leftovers.
 _OURS = f"colmap-av1-{zlib.crc32(socket.gethostname().encode()) & 0xFFFF:04x}"
+
+
+def is_hidden(path: PurePath) -> bool:
+    """Whether a part of a relative path begins with a dot."""
+    return any(part.startswith(".") for part in path.parts)
 
 
 def output_of_model(model: Path) -> Path | None:

@@ -13,5 +13,5 @@ def evenly_spread(count: int, most: int, *, rounded: bool = False) -> list[int]:
         most: largest number of indices.
         rounded: round positions to the nearest index instead of down.
     """
-    index = np.linspace(0, count - 1, max(min(most, count), 0))
-    return sorted(set((index.round() if rounded else index).astype(int).tolist()))
+    position = np.linspace(0, count - 1, max(min(most, count), 0))
+    return sorted(set((position.round() if rounded else position).astype(int).tolist()))

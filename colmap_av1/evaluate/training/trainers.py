@@ -203,9 +203,10 @@ def train(
         states = [_plain(state) for state in _states(renders, stops, references)]
         return {"seconds": measured.seconds, "states": states}
 
+    # The command may name a script, which can change. Other words may be too long for `Path`.
     words = words_of_trainer(trainer) if trainer != GSPLAT else []
-    programs = [file_digest(Path(word)) for word in words if os.path.isfile(word)]
-    depends_on = (trainer, programs, given, iterations, stops)
+    scripts = [file_digest(Path(word)) for word in words if os.path.isfile(word)]
+    depends_on = (trainer, scripts, given, iterations, stops)
     finished = run_stage_in(folder, depends_on, make, products=[renders], made_by=_CODE)
     states = tuple(_milestone(state) for state in finished.result["states"])
     last = renders / str(iterations) if states else renders
