@@ -29,6 +29,7 @@ from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.observable import has_observable_depth
 from colmap_av1.options import CompareOptions, DensifyOptions, MapOptions
 from colmap_av1.tracks.video_tracks import with_stream_kept
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.files import check_apart
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import open_stages
@@ -59,8 +60,8 @@ class _Reference:
         is_truth: whether the poses are a given truth.
     """
 
-    poses: NDArray[np.float64] | None = None
-    points: NDArray[np.float64] | None = None
+    poses: Floats | None = None
+    points: Floats | None = None
     pose_source: str = ""
     cloud_source: str = ""
     is_truth: bool = False

@@ -10,9 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np  # before pycolmap: the other order breaks writing PNG files later
-from numpy.typing import NDArray
-
 from colmap_av1.check.database import DatabaseCheck, check_database
 from colmap_av1.check.model import check_model, uncertainty_warning
 from colmap_av1.check.model_figures import ModelFigures
@@ -45,6 +42,7 @@ from colmap_av1.poses.placing.placement import (
     write_place,
 )
 from colmap_av1.poses.placing.up import some_spread, vertical_lines
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.files import check_new_folder, whole_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 
@@ -297,7 +295,7 @@ def _place(
     model = read_model(folder)
     images = [*posed_images(model).values()]
 
-    def lines(up: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    def lines(up: Floats) -> list[Floats]:
         return [
             vertical_lines(
                 read_image(image_file(image_path, image.name)),

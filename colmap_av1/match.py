@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_of_videos
 from colmap_av1.database.reading import DatabaseImage, read_images
@@ -59,6 +58,7 @@ from colmap_av1.poses.start_trials import demote_failing_starts
 from colmap_av1.poses.track_stage import VideoTracks, encoding_for_pictures
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.video_tracks import decodable_frames
+from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import check_outside, scratch_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -414,7 +414,7 @@ class _Images:
 
     inputs: Inputs
     videos: Sequence[PreparedImages]
-    fast: Sequence[NDArray[np.bool_]]
+    fast: Sequence[Bools]
     image_set: ImageSet
 
     @property
@@ -664,7 +664,7 @@ def _with_selected_tracks(
     return replace(prepared, tracked=tracked.with_tracks(tracks))
 
 
-def _length_quantiles(lengths: NDArray[np.int64]) -> dict[float, int]:
+def _length_quantiles(lengths: Ints) -> dict[float, int]:
     """Quantiles of the lengths of tracks; empty without tracks."""
     if len(lengths) == 0:
         return {}

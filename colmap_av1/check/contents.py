@@ -21,6 +21,7 @@ from colmap_av1.matching.mapper_limits import (
     MIN_INLIERS,
 )
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, UNUSED_CONFIGS, TwoViewConfig
+from colmap_av1.util.arrays import Bools, Floats, Ints
 
 # The model that determines the pose, by configuration. Other configurations have no single model.
 _MODEL_OF_CONFIG = {
@@ -75,7 +76,7 @@ class Images:
         num_descriptors: number of descriptors of each image; -1 if it has no row of descriptors.
     """
 
-    ids: NDArray[np.int64]
+    ids: Ints
     names: list[str]
     camera_ids: list[int]
     keypoints: list[NDArray[np.float32]]
@@ -103,21 +104,21 @@ class Pairs:
         num_foreign: number of pairs of unlisted images that have enough inliers to be used.
     """
 
-    ids: NDArray[np.int64]
-    index: NDArray[np.int64]
-    num_matches: NDArray[np.int64]
-    num_inliers: NDArray[np.int64]
-    config: NDArray[np.int64]
-    displacement: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    matched: list[NDArray[np.bool_]]
+    ids: Ints
+    index: Ints
+    num_matches: Ints
+    num_inliers: Ints
+    config: Ints
+    displacement: Floats
+    spread: Floats
+    matched: list[Bools]
     num_astray: int
     num_with_itself: int
     num_swapped: int
     num_foreign: int
 
     @property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Bools:
         """Pairs that the mappers of all COLMAP versions use, bool [m]."""
         return (self.num_inliers >= MIN_INLIERS) & ~np.isin(self.config, UNUSED_CONFIGS)
 

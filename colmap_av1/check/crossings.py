@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.database.file import open_unaltered
 from colmap_av1.database.reading import (
@@ -21,8 +20,7 @@ from colmap_av1.geometry.colmap_model import ModelImage, posed_images
 from colmap_av1.matching.mapper_limits import MIN_INLIERS
 from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.poses.seams import images_in_time
-
-_Floats = NDArray[np.float64]
+from colmap_av1.util.arrays import Bools, Floats, Ints
 
 # A match fits the poses within this Sampson error in pixels, COLMAP's limit for inliers.
 _MAX_ERROR = 4.0
@@ -44,11 +42,11 @@ class Crossings:
     """
 
     pairs: tuple[tuple[str, str], ...]
-    num_matches: NDArray[np.int64]
-    num_fitting: NDArray[np.int64]
+    num_matches: Ints
+    num_fitting: Ints
 
     @property
-    def share(self) -> _Floats:
+    def share(self) -> Floats:
         """Share of the matches that fit; 1 if there are too few to judge."""
         share = self.num_fitting / np.maximum(self.num_matches, 1)
         return np.where(self.num_matches >= _FEWEST, share, 1.0)
@@ -114,7 +112,7 @@ def model_crossings(reconstruction: pycolmap.Reconstruction, database: Path) -> 
 
 def _fitting(
     images: list[ModelImage], cameras: pycolmap.CameraMap, database: Path
-) -> Iterator[tuple[int, int, NDArray[np.bool_]]]:
+) -> Iterator[tuple[int, int, Bools]]:
     """Yield each matched pair as indices i < j, with a mask of the matches that fit the poses.
 
     Keypoints are undistorted with the cameras of the model.
@@ -131,7 +129,7 @@ def _fitting(
                 f"{database}: lists no image of the model: give the database that the model was "
                 "mapped from"
             )
-        rays: dict[int, _Floats] = {}
+        rays: dict[int, Floats] = {}
         for image_id, *row in connection.execute(
             "SELECT image_id, rows, cols, data FROM keypoints WHERE rows > 0"
         ):

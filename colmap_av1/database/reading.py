@@ -18,6 +18,7 @@ from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.layout import MAX_NUM_IMAGES, columns
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.cameras import camera_fault
+from colmap_av1.util.arrays import Floats
 
 # Neutral values of a keypoint's columns after x and y, by the number of columns: scale and
 # orientation for 4, a 2x2 affine shape for 6.
@@ -124,7 +125,7 @@ class PosePrior:
         is_cartesian: whether the position is Cartesian.
     """
 
-    position: NDArray[np.float64]
+    position: Floats
     is_cartesian: bool
 
 

@@ -27,6 +27,7 @@ from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import OnExisting
+from colmap_av1.util.arrays import Floats
 
 # COLMAP's SensorType of a camera.
 _CAMERA_SENSOR = 0
@@ -46,7 +47,7 @@ def write_matches(
     matched: MatchedImages,
     on_existing: OnExisting = "error",
     *,
-    places: NDArray[np.float64] | None = None,
+    places: Floats | None = None,
 ) -> None:
     """Write keypoints, matches and two-view geometries: all rows, or none.
 
@@ -436,7 +437,7 @@ def _swapped(matches: NDArray[np.uint32], swap: bool) -> NDArray[np.uint32]:
     return matches[:, ::-1] if swap else matches
 
 
-def _float_blob(values: NDArray[np.float64] | None) -> bytes | None:
+def _float_blob(values: Floats | None) -> bytes | None:
     return None if values is None else np.asarray(values, dtype="<f8").tobytes()
 
 
@@ -509,9 +510,7 @@ def _complete_frames(connection: sqlite3.Connection, path: Path) -> None:
         )
 
 
-def _write_places(
-    connection: sqlite3.Connection, image_ids: Sequence[int], places: NDArray[np.float64]
-) -> None:
+def _write_places(connection: sqlite3.Connection, image_ids: Sequence[int], places: Floats) -> None:
     """Write pose priors for images that have none.
 
     A database of COLMAP 3.8 or 3.9 also gets them in the columns that these versions read.
@@ -543,9 +542,7 @@ def _write_places(
         )
 
 
-def _write_newer(
-    connection: sqlite3.Connection, known: Sequence[tuple[int, NDArray[np.float64]]]
-) -> None:
+def _write_newer(connection: sqlite3.Connection, known: Sequence[tuple[int, Floats]]) -> None:
     """Write pose priors in the layout of COLMAP 4.0 and later."""
     camera_of = dict(connection.execute("SELECT image_id, camera_id FROM images").fetchall())
     connection.executemany(

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
-from numpy.typing import NDArray
 
-_Floats = NDArray[np.float64]
+from colmap_av1.util.arrays import Bools, Floats
 
 # Inlier threshold of GPS positions in metres: their usual scatter within minutes. Positions with
 # larger errors are outliers.
@@ -42,7 +41,7 @@ class Up:
         error: standard error of the direction in radians.
     """
 
-    direction: _Floats
+    direction: Floats
     error: float
 
 
@@ -63,7 +62,7 @@ class PathFit:
     scale_error: float
 
 
-def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | str:
+def fit_path(path: Floats, positions: Floats, up: Up, seed: int) -> PathFit | str:
     """Align a camera path with positions that may contain outliers.
 
     A straight path does not determine the rotation about itself. Therefore virtual points above
@@ -110,14 +109,14 @@ def fit_path(path: _Floats, positions: _Floats, up: Up, seed: int) -> PathFit | 
     return PathFit(similarity, int(used.sum()), error, float(scale_error))
 
 
-def transform_poses(similarity: pycolmap.Sim3d, cam_from_world: _Floats) -> _Floats:
+def transform_poses(similarity: pycolmap.Sim3d, cam_from_world: Floats) -> Floats:
     """Transform cam_from_world poses, float64 [n, 3, 4], to the target world of a similarity."""
     rotation = cam_from_world[:, :, :3] @ np.asarray(similarity.rotation.matrix()).T
     translation = similarity.scale * cam_from_world[:, :, 3] - rotation @ similarity.translation
     return np.concatenate([rotation, translation[:, :, None]], axis=2)
 
 
-def east_north_up(places: _Floats, origin: tuple[float, float, float]) -> _Floats:
+def east_north_up(places: Floats, origin: tuple[float, float, float]) -> Floats:
     """Local tangent-plane coordinates: float64 [n, 3] metres east, north and up of an origin.
 
     Args:
@@ -140,8 +139,8 @@ def east_north_up(places: _Floats, origin: tuple[float, float, float]) -> _Float
 
 
 def _refined(
-    path: _Floats, positions: _Floats, up: Up, start: pycolmap.Sim3d
-) -> tuple[pycolmap.Sim3d, NDArray[np.bool_]]:
+    path: Floats, positions: Floats, up: Up, start: pycolmap.Sim3d
+) -> tuple[pycolmap.Sim3d, Bools]:
     """Least-squares similarity of the inlier positions and the up direction.
 
     Scale and translation depend on the positions only (Umeyama 1991). The up direction contributes
@@ -176,11 +175,11 @@ def _refined(
     return found, used
 
 
-def _spread(points: _Floats) -> float:
+def _spread(points: Floats) -> float:
     return float(np.sqrt(np.mean(((points - np.median(points, axis=0)) ** 2).sum(axis=1))))
 
 
-def _rough_scale(path: _Floats, positions: _Floats) -> float | None:
+def _rough_scale(path: Floats, positions: Floats) -> float | None:
     """Metres per unit of the path, from pairs of distant images.
 
     A lower quantile than the median is used, because an outlier in a pair increases its distance,

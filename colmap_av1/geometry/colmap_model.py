@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, ModelError
 from colmap_av1.geometry.cameras import camera_fault
+from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.files import may_read
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.texts import check_name
@@ -63,7 +64,7 @@ class ModelImage:
     image_id: int
     name: str
     camera_id: int
-    cam_from_world: NDArray[np.float64]
+    cam_from_world: Floats
 
 
 @dataclass(frozen=True)
@@ -82,15 +83,15 @@ class ModelPoints:
             (0.5, 0.5).
     """
 
-    xyz: NDArray[np.float64]
+    xyz: Floats
     rgb: NDArray[np.uint8]
-    error: NDArray[np.float64]
-    offsets: NDArray[np.int64]
-    image: NDArray[np.int64]
-    xy: NDArray[np.float64]
+    error: Floats
+    offsets: Ints
+    image: Ints
+    xy: Floats
 
     @property
-    def point(self) -> NDArray[np.int64]:
+    def point(self) -> Ints:
         """Index of the point of each observation: int64 [num_observations]."""
         return np.repeat(np.arange(len(self.xyz)), np.diff(self.offsets))
 
@@ -108,9 +109,7 @@ def joined_points(parts: Sequence[ModelPoints]) -> ModelPoints:
     )
 
 
-def take_rows(
-    offsets: NDArray[np.int64], rows: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def take_rows(offsets: Ints, rows: Ints) -> tuple[Ints, Ints]:
     """Select rows of data in compressed sparse row form.
 
     Args:
@@ -125,7 +124,7 @@ def take_rows(
     return taken, np.arange(taken[-1]) + np.repeat(offsets[rows] - taken[:-1], lengths)
 
 
-def take_points(points: ModelPoints, rows: NDArray[np.int64]) -> ModelPoints:
+def take_points(points: ModelPoints, rows: Ints) -> ModelPoints:
     """Select points, in the order of `rows`."""
     offsets, seen = take_rows(points.offsets, rows)
     return ModelPoints(
@@ -138,9 +137,7 @@ def take_points(points: ModelPoints, rows: NDArray[np.int64]) -> ModelPoints:
     )
 
 
-def keep_observations(
-    points: ModelPoints, kept: NDArray[np.bool_]
-) -> tuple[ModelPoints, NDArray[np.int64]]:
+def keep_observations(points: ModelPoints, kept: Bools) -> tuple[ModelPoints, Ints]:
     """Keep some of the observations, and the points with two or more of them.
 
     Args:
@@ -177,7 +174,7 @@ def no_points() -> ModelPoints:
     )
 
 
-def camera_centres(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+def camera_centres(cam_from_world: Floats) -> Floats:
     """Camera centres in the world, float64 [n, 3], of cam_from_world poses [n, 3, 4]."""
     rotation, translation = cam_from_world[:, :, :3], cam_from_world[:, :, 3]
     return np.asarray(-np.einsum("nij,ni->nj", rotation, translation), dtype=np.float64)

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.geometry.colmap_model import ModelImage, posed_images
 from colmap_av1.geometry.masks import Mask
+from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.spread import evenly_spread
-
-_Floats = NDArray[np.float64]
 
 # Width of a cell in pixels.
 CELL = 16
@@ -44,7 +42,7 @@ class PosedCamera:
     """
 
     camera: pycolmap.Camera
-    cam_from_world: _Floats
+    cam_from_world: Floats
     mask: Mask | None = None
 
     @property
@@ -53,12 +51,12 @@ class PosedCamera:
         return int(self.camera.width), int(self.camera.height)
 
     @property
-    def centre(self) -> _Floats:
+    def centre(self) -> Floats:
         """Camera centre in the world, float64 [3]."""
         return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3])
 
     @property
-    def valid_cells(self) -> NDArray[np.bool_]:
+    def valid_cells(self) -> Bools:
         """Cells of the image with valid pixels and a ray in the middle, bool [rows, columns]."""
         width, height = self.size
         rows, columns = -(-height // CELL), -(-width // CELL)
@@ -73,7 +71,7 @@ class PosedCamera:
         return np.asarray(seen & kept.reshape(rows, CELL, columns, CELL).any(axis=(1, 3)))
 
     @functools.cached_property
-    def _seen_rays(self) -> tuple[_Floats, _Floats] | None:
+    def _seen_rays(self) -> tuple[Floats, Floats] | None:
         """Smallest and largest (x / z, y / z) on the edge of the image, with a margin of 1 %.
 
         None if a point of the edge has no ray.
@@ -89,27 +87,27 @@ class PosedCamera:
         margin = 0.01 * (high - low)
         return low - margin, high + margin
 
-    def _have_rays(self, xy: _Floats) -> NDArray[np.bool_]:
+    def _have_rays(self, xy: Floats) -> Bools:
         """Whether pixels [n, 2] of the image have a ray, which is slow to find out."""
         return np.ones(len(xy), np.bool_) if self._seen_rays else self._on_rays(xy)
 
-    def _on_rays(self, xy: _Floats) -> NDArray[np.bool_]:
+    def _on_rays(self, xy: Floats) -> Bools:
         """Whether pixels [n, 2] are the projections of their rays."""
         # COLMAP gives NaN or the ray of another pixel for those without one.
         again = np.asarray(self.camera.img_from_cam(self.rays(xy))).reshape(-1, 2)
         return np.asarray(np.linalg.norm(again - xy, axis=1) <= _SAME_PIXEL)
 
-    def keeps(self, xy: _Floats) -> NDArray[np.bool_]:
+    def keeps(self, xy: Floats) -> Bools:
         """Whether pixels [n, 2] of the image are valid and have a ray."""
         seen = self._have_rays(xy)
         return seen if self.mask is None else seen & self.mask.keeps(xy, self.size)
 
-    def rays(self, xy: _Floats) -> _Floats:
+    def rays(self, xy: Floats) -> Floats:
         """Rays in camera coordinates of pixels [n, 2], float64 [n, 3] with z = 1."""
         rays = np.asarray(self.camera.cam_from_img(xy)).reshape(-1, 2)
         return np.column_stack([rays, np.ones(len(rays))])
 
-    def project(self, xyz: _Floats) -> tuple[NDArray[np.int64], _Floats, _Floats]:
+    def project(self, xyz: Floats) -> tuple[Ints, Floats, Floats]:
         """Project points, and keep those within the image.
 
         Args:
@@ -137,7 +135,7 @@ class PosedCamera:
             inside[inside] = self.sees(own[inside], xy[inside])
         return index[inside], xy[inside], own[inside, 2]
 
-    def sees(self, own: _Floats, xy: _Floats) -> NDArray[np.bool_]:
+    def sees(self, own: Floats, xy: Floats) -> Bools:
         """Whether points lie in the field of view of their pixels.
 
         Outside it, the distortion model may project points into the image.
@@ -168,7 +166,7 @@ def views_of(
     ]
 
 
-def coverage(views: Sequence[PosedCamera], xyz: _Floats) -> float:
+def coverage(views: Sequence[PosedCamera], xyz: Floats) -> float:
     """Share of the images' cells of 16x16 pixels into which a visible point projects.
 
     A point that is visible only through a gap in a nearer surface does not count, and neither do
@@ -199,7 +197,7 @@ def coverage_of_model(reconstruction: pycolmap.Reconstruction) -> float:
     return coverage(views, xyz.reshape(-1, 3))
 
 
-def nearest_depth(view: PosedCamera, xyz: _Floats) -> _Floats:
+def nearest_depth(view: PosedCamera, xyz: Floats) -> Floats:
     """Depth of the nearest point in each cell of an image, including points in gaps.
 
     Args:
@@ -213,14 +211,14 @@ def nearest_depth(view: PosedCamera, xyz: _Floats) -> _Floats:
     return nearest_in_cells(view.size, xy, depth)
 
 
-def nearest_in_cells(size: tuple[int, int], xy: _Floats, depth: _Floats) -> _Floats:
+def nearest_in_cells(size: tuple[int, int], xy: Floats, depth: Floats) -> Floats:
     """Smallest depth in each cell of an image of `size`, of depths [n] at pixels [n, 2]."""
     columns, rows = (-(-length // CELL) for length in size)
     # The core assigns pixels on the right and bottom edges to the last cell.
     return _core.nearest_in_cells(xy, depth, cell=CELL, columns=columns, rows=rows)
 
 
-def squares_of_cells(rows: NDArray[np.int64], columns: NDArray[np.int64], per_side: int) -> _Floats:
+def squares_of_cells(rows: Ints, columns: Ints, per_side: int) -> Floats:
     """Centres in pixels [n, 2] of the squares in cells, `per_side` ** 2 for each cell in turn."""
     places = (np.arange(per_side) + 0.5) * (CELL / per_side)
     x = columns[:, None] * CELL + np.tile(places, per_side)
@@ -228,7 +226,7 @@ def squares_of_cells(rows: NDArray[np.int64], columns: NDArray[np.int64], per_si
     return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)
 
 
-def without_gaps(grid: _Floats) -> _Floats:
+def without_gaps(grid: Floats) -> Floats:
     """Nearest depths, with inf for cells well behind at least 7 of their 8 neighbours."""
     rows, columns = grid.shape
     padded = np.pad(grid, 1, constant_values=np.inf)

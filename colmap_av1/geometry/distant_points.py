@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.geometry.colmap_model import camera_centres, take_rows
@@ -20,9 +19,7 @@ from colmap_av1.geometry.triangulation import (
     triangulate,
 )
 from colmap_av1.options import TriangulateOptions
-
-_Floats = NDArray[np.float64]
-_Ints = NDArray[np.int64]
+from colmap_av1.util.arrays import Bools, Floats, Ints
 
 # Distances with a smaller relative uncertainty determine the depth of the scene.
 _KNOWN = 0.3
@@ -50,22 +47,22 @@ _TINY = 1e-12
 class _Points:
     """Points and their observations in compressed sparse row form, as in TriangulatedPoints."""
 
-    xyz: _Floats
-    error: _Floats
-    offsets: _Ints
-    observation: _Ints
+    xyz: Floats
+    error: Floats
+    offsets: Ints
+    observation: Ints
 
     @property
-    def owner(self) -> _Ints:
+    def owner(self) -> Ints:
         """Point of each observation."""
         return np.repeat(np.arange(len(self.xyz)), np.diff(self.offsets))
 
     @property
-    def middle(self) -> _Ints:
+    def middle(self) -> Ints:
         """The middle observation of each point."""
         return np.asarray(self.observation[(self.offsets[:-1] + self.offsets[1:]) // 2])
 
-    def take(self, rows: _Ints) -> _Points:
+    def take(self, rows: Ints) -> _Points:
         """Select points, in the order of `rows`."""
         offsets, seen = take_rows(self.offsets, rows)
         return _Points(self.xyz[rows], self.error[rows], offsets, self.observation[seen])
@@ -77,16 +74,16 @@ class _Seen:
 
     observations: Observations
     views: Views
-    centres: _Floats
+    centres: Floats
 
-    def rays(self, rows: _Ints) -> _Floats:
+    def rays(self, rows: Ints) -> Floats:
         """Unit viewing directions in the world of some observations, float64 [n, 3]."""
         rays = np.column_stack([self.observations.rays[rows], np.ones(len(rows))])
         rotation = self.views.cam_from_world[self.observations.view[rows], :, :3]
         rays = np.einsum("nji,nj->ni", rotation, rays)
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
-    def origins(self, rows: _Ints) -> _Floats:
+    def origins(self, rows: Ints) -> Floats:
         """Camera centres of some observations, float64 [n, 3]."""
         return self.centres[self.observations.view[rows]]
 
@@ -102,7 +99,7 @@ class _Seen:
             "observation": points.observation,
         }
 
-    def errors(self, points: _Points) -> _Floats:
+    def errors(self, points: _Points) -> Floats:
         """Reprojection errors in pixels of the points' observations; inf behind the camera."""
         return _core.reprojection_errors(**self.of_points(points))
 
@@ -156,14 +153,14 @@ def splat_points(
 
 
 def distance_uncertainty(
-    xyz: _Floats,
-    error: _Floats,
-    offsets: _Ints,
+    xyz: Floats,
+    error: Floats,
+    offsets: Ints,
     *,
-    centres: _Floats,
-    view: _Ints,
-    focal: _Floats,
-) -> _Floats:
+    centres: Floats,
+    view: Ints,
+    focal: Floats,
+) -> Floats:
     """Relative uncertainty of each point's distance from the cameras, float64 [n].
 
     Args:
@@ -182,12 +179,12 @@ def distance_uncertainty(
     return np.asarray(sigma / (focal[middle] * np.maximum(angle, _TINY)))
 
 
-def _distance(points: _Points, seen: _Seen) -> _Floats:
+def _distance(points: _Points, seen: _Seen) -> Floats:
     """Distance of each point from the view of its middle observation."""
     return np.asarray(np.linalg.norm(points.xyz - seen.origins(points.middle), axis=1))
 
 
-def _far_distance(points: _Points, unsure: _Floats, seen: _Seen) -> float:
+def _far_distance(points: _Points, unsure: Floats, seen: _Seen) -> float:
     """Assumed distance of the scene's far field."""
     extent = float(np.linalg.norm(seen.centres - seen.centres.mean(axis=0), axis=1).max())
     known = _distance(points, seen)[unsure < _KNOWN]
@@ -195,7 +192,7 @@ def _far_distance(points: _Points, unsure: _Floats, seen: _Seen) -> float:
     return max(_FAR * deepest, _FAR_EXTENTS * extent) or _ANY_FAR
 
 
-def _at_likely_distance(points: _Points, unsure: _Floats, far: float, seen: _Seen) -> _Points:
+def _at_likely_distance(points: _Points, unsure: Floats, far: float, seen: _Seen) -> _Points:
     """Move points along their middle ray towards the far field, within their uncertainty.
 
     The inverse distance is combined with a prior at the far field, whose standard deviation is the
@@ -265,7 +262,7 @@ def _merged(one: _Points, two: _Points) -> _Points:
     return both.take(np.argsort(both.observation[both.offsets[:-1]], kind="stable"))
 
 
-def _is_floater(points: _Points, seen: _Seen) -> NDArray[np.bool_]:
+def _is_floater(points: _Points, seen: _Seen) -> Bools:
     """Whether each point is a floater: nearly alone far in front of its surroundings."""
     votes = _core.floater_observations(
         **seen.of_points(points),

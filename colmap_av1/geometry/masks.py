@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.util.arrays import Bools
+
 # Higher levels make masks hardly smaller.
 _COMPRESSION = 1
 
@@ -28,13 +30,13 @@ class Mask:
     share: float
 
     @property
-    def kept(self) -> NDArray[np.bool_]:
+    def kept(self) -> Bools:
         """The valid pixels, bool [height, width]."""
         width, height = self.size
         bits = np.frombuffer(zlib.decompress(self.packed), np.uint8)
         return np.unpackbits(bits, count=width * height).reshape(height, width).view(np.bool_)
 
-    def keeps(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.bool_]:
+    def keeps(self, xy: NDArray[np.floating], size: tuple[int, int]) -> Bools:
         """Whether positions in a picture lie on valid pixels.
 
         Args:
@@ -44,7 +46,7 @@ class Mask:
         return valid_at(self.kept, xy, size)
 
 
-def make_mask(kept: NDArray[np.bool_]) -> Mask:
+def make_mask(kept: Bools) -> Mask:
     """Make a mask of valid pixels, bool [height, width]."""
     height, width = kept.shape
     packed = zlib.compress(np.packbits(kept).tobytes(), _COMPRESSION)
@@ -62,9 +64,7 @@ def joined_masks(a: Mask | None, b: Mask | None) -> Mask | None:
     return make_mask(a.kept & other)
 
 
-def valid_at(
-    kept: NDArray[np.bool_], xy: NDArray[np.floating], size: tuple[int, int]
-) -> NDArray[np.bool_]:
+def valid_at(kept: Bools, xy: NDArray[np.floating], size: tuple[int, int]) -> Bools:
     """Whether positions lie on valid pixels, see `Mask.keeps`."""
     # Column by column: NumPy is several times slower on rows of two elements.
     column, row = (

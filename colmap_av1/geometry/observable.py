@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import camera_centres, posed_images
 from colmap_av1.geometry.distant_points import distance_uncertainty
-
-_Floats = NDArray[np.float64]
+from colmap_av1.util.arrays import Bools, Floats
 
 # A point's depth is observable below this relative uncertainty of its distance. Above it, points of
 # a surface spread visibly along their rays.
@@ -18,7 +16,7 @@ _OBSERVABLE = 0.1
 _FRAMED = (0.02, 0.98)
 
 
-def has_observable_depth(model: pycolmap.Reconstruction) -> NDArray[np.bool_]:
+def has_observable_depth(model: pycolmap.Reconstruction) -> Bools:
     """Whether the images of a pycolmap.Reconstruction determine the distance of each point.
 
     The test uses the angles between the rays of a point's first, middle and last observation.
@@ -58,9 +56,7 @@ def _three_images(track: pycolmap.Track) -> list[int]:
     return [int(track.element(k).image_id) for k in (0, length // 2, length - 1) if 0 <= k < length]
 
 
-def framed_box(
-    points: _Floats, observable: NDArray[np.bool_], centres: _Floats
-) -> tuple[_Floats, _Floats]:
+def framed_box(points: Floats, observable: Bools, centres: Floats) -> tuple[Floats, Floats]:
     """The box that contains all cameras and nearly all points with observable depth.
 
     Args:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import (
@@ -24,6 +23,7 @@ from colmap_av1.geometry.colmap_model import (
     no_points,
     posed_images,
 )
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.grouping import grouped
 
 
@@ -64,7 +64,7 @@ def posed_model(
     return PosedModel(cameras, images, points)
 
 
-def reprojection_errors(model: PosedModel) -> NDArray[np.float64]:
+def reprojection_errors(model: PosedModel) -> Floats:
     """Reprojection error of each observation of a model's points, in pixels.
 
     Returns:

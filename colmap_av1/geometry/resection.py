@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.util.digests import seed_of
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.threads import map_on_threads
-
-_Floats = NDArray[np.float64]
 
 # Largest error in pixels of an inlier, and smallest number of inliers of an accepted pose, as in
 # COLMAP's mapper.
@@ -39,9 +38,9 @@ class Sightings:
         bounds: int64 [num_images + 1]; image i has the observations bounds[i] : bounds[i + 1].
     """
 
-    rays: _Floats
-    xyz: _Floats
-    bounds: NDArray[np.int64]
+    rays: Floats
+    xyz: Floats
+    bounds: Ints
 
 
 def sightings_of(
@@ -84,14 +83,14 @@ def sightings_of(
 
 def resect(
     sightings: Sightings,
-    guesses: _Floats,
-    focal: _Floats,
+    guesses: Floats,
+    focal: Floats,
     *,
     loss_scale: float = _LOSS_SCALE,
     seed: int = 0,
     num_threads: int | None = None,
     progress: Callable[[int], None] | None = None,
-) -> list[_Floats | None]:
+) -> list[Floats | None]:
     """Estimate the pose of each image from its observations, with PoseLib.
 
     Args:
@@ -107,7 +106,7 @@ def resect(
         The pose float64 [3, 4] of each image; None for images with fewer than 30 inliers.
     """
 
-    def work(image: int) -> _Floats | None:
+    def work(image: int) -> Floats | None:
         own = slice(int(sightings.bounds[image]), int(sightings.bounds[image + 1]))
         rays, xyz = sightings.rays[own], sightings.xyz[own]
         return _resect_one(
@@ -119,7 +118,7 @@ def resect(
             seed=seed_of(seed, image),
         )
 
-    found: list[_Floats | None] = []
+    found: list[Floats | None] = []
     for pose in map_on_threads(work, range(len(guesses)), num_threads):
         found.append(pose)
         if progress is not None:
@@ -128,14 +127,14 @@ def resect(
 
 
 def _resect_one(
-    rays: _Floats,
-    xyz: _Floats,
-    guess: _Floats,
+    rays: Floats,
+    xyz: Floats,
+    guess: Floats,
     focal: float,
     *,
     loss_scale: float,
     seed: int,
-) -> _Floats | None:
+) -> Floats | None:
     import poselib  # noqa: PLC0415 - after NumPy
 
     if len(rays) < _MIN_INLIERS:
@@ -157,8 +156,8 @@ def _resect_one(
 
 
 def interpolate_poses(
-    cam_from_world: _Floats, frames: NDArray[np.int32], wanted: NDArray[np.int32]
-) -> _Floats:
+    cam_from_world: Floats, frames: NDArray[np.int32], wanted: NDArray[np.int32]
+) -> Floats:
     """Interpolate poses: linear interpolation of camera centres, spherical of rotations.
 
     Args:

@@ -16,10 +16,9 @@ from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, 
 from colmap_av1.geometry.undistortion import Undistortion
 from colmap_av1.options import TrackOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Floats, Ints, Picture
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.progress import Progress
-
-_Image = NDArray[np.uint8]
 
 # If a smaller share of the tracks agrees with the poses, the model is not of the same video.
 LEAST_AGREEING = 0.5
@@ -56,7 +55,7 @@ def chaining_for_points(
     return options
 
 
-def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, NDArray[np.int64]]:
+def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, Ints]:
     """The tracks restricted to some frames, and the index into `frames` of each observation."""
     place = np.full(tracks.num_frames, -1, dtype=np.int64)
     place[frames] = np.arange(len(frames))
@@ -90,15 +89,15 @@ def tracks_of_points(
 
 def triangulate_tracks(
     tracks: Tracks,
-    view: NDArray[np.int64],
+    view: Ints,
     cameras: Sequence[pycolmap.Camera],
-    poses: Sequence[NDArray[np.float64]],
+    poses: Sequence[Floats],
     pinholes: Sequence[pycolmap.Camera] | None,
     *,
     options: TriangulateOptions,
     num_threads: int | None,
     progress: Progress,
-    rays: NDArray[np.float64] | None = None,
+    rays: Floats | None = None,
 ) -> TriangulatedPoints:
     """Triangulate all tracks as `options.points` requests.
 
@@ -119,9 +118,7 @@ def triangulate_tracks(
     )
 
 
-def rays_of(
-    tracks: Tracks, view: NDArray[np.int64], cameras: Sequence[pycolmap.Camera]
-) -> NDArray[np.float64]:
+def rays_of(tracks: Tracks, view: Ints, cameras: Sequence[pycolmap.Camera]) -> Floats:
     """Undistorted positions (x / z, y / z) of observations, float64 [num_observations, 2].
 
     Args:
@@ -158,7 +155,7 @@ class Colours:
         self._order, self._bounds = grouped(points.image, len(sizes))
         self._seen = np.zeros((len(points.image), 3), np.uint8)
 
-    def add(self, image: int, picture: _Image, undistortion: Undistortion | None = None) -> None:
+    def add(self, image: int, picture: Picture, undistortion: Undistortion | None = None) -> None:
         """Sample the picture (BGR, of any scale) of an image.
 
         The picture has the camera of the model, after `undistortion` if given.
@@ -170,7 +167,7 @@ class Colours:
         shown = undistortion.pixels(picture, x, y) if undistortion is not None else picture[y, x]
         self._seen[own] = shown[:, ::-1]
 
-    def rgb(self) -> _Image:
+    def rgb(self) -> Picture:
         """Colours, uint8 [num_points, 3] RGB."""
         first, lengths = self._points.offsets[:-1], np.diff(self._points.offsets)
         most = int(lengths.max(initial=1))
@@ -215,9 +212,7 @@ def fitting_in_images(
     return take_points(replace(points, error=error), np.flatnonzero(error <= max_error))
 
 
-def to_model_points(
-    points: TriangulatedPoints, view: NDArray[np.int64], xy: NDArray[np.float64]
-) -> ModelPoints:
+def to_model_points(points: TriangulatedPoints, view: Ints, xy: Floats) -> ModelPoints:
     """Convert to black model points; `xy` are the pixels of the points' observations."""
     black = np.zeros((len(points.xyz), 3), np.uint8)
     return ModelPoints(

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.options import TriangulateOptions
+from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.util.threads import map_on_threads
 
-_Floats = NDArray[np.float64]
-_Ints = NDArray[np.int64]
 # Result of the core for a range of tracks, see `TriangulatedPoints`.
-_Part = tuple[_Floats, _Floats, _Ints, _Ints, int, int]
+_Part = tuple[Floats, Floats, Ints, Ints, int, int]
 
 # Number of observations in a unit of work, small enough to report progress and use all threads.
 _CHUNK = 65_536
@@ -36,8 +35,8 @@ class Views:
         focal: float64 [n, 2] focal lengths along x and y, which convert errors to pixels.
     """
 
-    cam_from_world: _Floats
-    focal: _Floats
+    cam_from_world: Floats
+    focal: Floats
 
 
 @dataclass(frozen=True)
@@ -52,9 +51,9 @@ class Observations:
         sigma: float32 [num_observations] expected error in pixels.
     """
 
-    offsets: NDArray[np.int64]
-    view: NDArray[np.int64]
-    rays: _Floats
+    offsets: Ints
+    view: Ints
+    rays: Floats
     sigma: NDArray[np.float32]
 
 
@@ -74,15 +73,15 @@ class TriangulatedPoints:
         num_tracks: number of tracks with enough observations.
     """
 
-    xyz: _Floats
-    error: _Floats
-    offsets: NDArray[np.int64]
-    observation: NDArray[np.int64]
+    xyz: Floats
+    error: Floats
+    offsets: Ints
+    observation: Ints
     num_agreeing: int
     num_tracks: int
 
     @property
-    def point(self) -> NDArray[np.int64]:
+    def point(self) -> Ints:
         """Index of the point of each observation: int64 [num_observations]."""
         return np.repeat(np.arange(len(self.xyz)), np.diff(self.offsets))
 

@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import camera_centres, keep_observations
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
+from colmap_av1.util.arrays import Floats
 
 # Largest expected error of the camera centres of a model that is certain, as a share of their
 # extent. Of 52 models of rendered walks, those below it were off by at most 0.26 % of their extent,
@@ -57,7 +57,7 @@ def expected_error(model: PosedModel) -> float | None:
     return float(np.sqrt(np.mean(errors**2))) if np.isfinite(errors).all() else None
 
 
-def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
+def centre_uncertainty(model: PosedModel) -> Floats:
     """Expected errors of the camera centres that follow from errors of the observations.
 
     They are the standard deviations of bundle adjustment of poses and points (Triggs et al., Bundle
@@ -144,7 +144,7 @@ def centre_uncertainty(model: PosedModel) -> NDArray[np.float64]:
     return np.asarray(median / _RAYLEIGH_MEDIAN * np.sqrt(variance))
 
 
-def _cross(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cross(vectors: Floats) -> Floats:
     """Matrices [n, 3, 3] of cross products with vectors [n, 3]."""
     x, y, z = vectors.T
     zero = np.zeros(len(vectors))
@@ -152,7 +152,7 @@ def _cross(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.stack([np.stack(row, axis=1) for row in rows], axis=1))
 
 
-def _gauge(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
+def _gauge(rotation: Floats, translation: Floats) -> Floats:
     """Orthonormal basis [6 n, 7] of the pose changes that follow a similarity transform."""
     changes = np.zeros((len(rotation), 6, _GAUGE_FREEDOMS))
     changes[:, 3:, :3] = rotation
@@ -162,7 +162,7 @@ def _gauge(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> N
     return np.asarray(np.linalg.qr(changes.reshape(-1, _GAUGE_FREEDOMS))[0])
 
 
-def _similarity_moves(centres: NDArray[np.float64]) -> NDArray[np.float64]:
+def _similarity_moves(centres: Floats) -> Floats:
     """Orthonormal basis [3 n, 7] of the moves of centres [n, 3] by similarity transforms.
 
     The basis has one column less if the centres lie on a line: a rotation about it moves none.

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.cameras import is_undistorted
 from colmap_av1.geometry.masks import Mask, make_mask
-
-_Image = NDArray[np.uint8]
+from colmap_av1.util.arrays import Floats, Ints, Picture
 
 # Range of the ratio of the focal lengths of the undistorted and the distorted camera.
 _ZOOM_RANGE = (0.25, 4.0)
@@ -82,14 +81,12 @@ def output_cameras(
     return {i: pinhole_camera(c) if undistort else c for i, c in cameras.items()}
 
 
-def _project(camera: pycolmap.Camera, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+def _project(camera: pycolmap.Camera, rays: Floats) -> Floats:
     """Project undistorted positions (x / z, y / z) to pixels."""
     return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
 
 
-def on_pinholes(
-    rays: NDArray[np.float64], view: NDArray[np.int64], pinholes: Sequence[pycolmap.Camera]
-) -> NDArray[np.float64]:
+def on_pinholes(rays: Floats, view: Ints, pinholes: Sequence[pycolmap.Camera]) -> Floats:
     """Pixels [n, 2] of undistorted positions (x / z, y / z) in the pinhole cameras of views [n]."""
     params = np.array([pinhole.params for pinhole in pinholes])
     if len(params) and (params == params[0]).all():
@@ -155,11 +152,11 @@ class Undistortion:
         height, width = self.source.shape[:2]
         return width, height
 
-    def __call__(self, picture: _Image) -> _Image:
+    def __call__(self, picture: Picture) -> Picture:
         """Undistort a picture, uint8 [height, width, ...]."""
         return self._looked_up(picture, self.source)
 
-    def pixels(self, picture: _Image, x: NDArray[np.int64], y: NDArray[np.int64]) -> _Image:
+    def pixels(self, picture: Picture, x: Ints, y: Ints) -> Picture:
         """Pixels [n, ...] of the undistorted picture at columns x [n] and rows y [n]."""
         # Arranged as a table, because cv2.remap limits the length of rows and columns.
         rows = -(-len(x) // _COLUMNS)
@@ -167,7 +164,7 @@ class Undistortion:
         found = self._looked_up(picture, source) if rows else picture[:0]
         return found.reshape(-1, *picture.shape[2:])[: len(x)]
 
-    def _looked_up(self, picture: _Image, source: NDArray[np.float32]) -> _Image:
+    def _looked_up(self, picture: Picture, source: NDArray[np.float32]) -> Picture:
         edge = cv2.BORDER_REPLICATE
         found = cv2.remap(picture, source, None, self.interpolation, borderMode=edge)
         return np.asarray(found, np.uint8)

@@ -29,13 +29,13 @@ from colmap_av1.images.names import (
 from colmap_av1.images.recognising import check_content, frames_by_content, frames_near
 from colmap_av1.options import ImageOptions
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Floats, Ints, Picture
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.texts import read_lines
 
-_Image = NDArray[np.uint8]
 # Yields (frame number, picture) of some frames, given by their numbers, in order; None: all. Frames
 # are numbered as players show them, from 0.
-_Decode = Callable[[Collection[int] | None], Iterable[tuple[int, _Image]]]
+_Decode = Callable[[Collection[int] | None], Iterable[tuple[int, Picture]]]
 
 # Added to times in ticks, which are rational numbers. At half the frame rate of a video, every
 # other time lies halfway between two ticks.
@@ -128,7 +128,7 @@ def choose_images(
     *,
     existing: Sequence[str],
     folder: Path | None,
-    times: Callable[[], NDArray[np.float64] | None],
+    times: Callable[[], Floats | None],
     decode: _Decode,
     tracks: Tracks | None = None,
     of_model: bool = False,
@@ -185,7 +185,7 @@ def choose_images(
 def choose_frames(
     num_frames: int,
     options: ImageOptions,
-    times: NDArray[np.float64] | None = None,
+    times: Floats | None = None,
 ) -> NDArray[np.int32]:
     """Choose the frames that become images: all, unless the options say otherwise.
 
@@ -226,7 +226,7 @@ def spread_in_parallax(tracks: Tracks, num_images: int) -> NDArray[np.int32]:
     return _evenly_spread(np.concatenate([[0.0], np.cumsum(parallax(tracks))]), num_images)
 
 
-def parallax(tracks: Tracks) -> NDArray[np.float64]:
+def parallax(tracks: Tracks) -> Floats:
     """Parallax between consecutive pictures: motion that the camera's rotation does not explain.
 
     The motion field of a rotation (Longuet-Higgins and Prazdny 1980, for a focal length of 1.2
@@ -261,7 +261,7 @@ def parallax(tracks: Tracks) -> NDArray[np.float64]:
 
 def skip_blurred(
     frames: NDArray[np.int32],
-    sharpness: Callable[[Sequence[int]], NDArray[np.float64]],
+    sharpness: Callable[[Sequence[int]], Floats],
 ) -> NDArray[np.int32]:
     """Replace blurred frames by sharp ones nearby.
 
@@ -480,13 +480,13 @@ def _at_steps(names: Sequence[str], num_frames: int, options: ImageOptions) -> N
     return np.array(numbers, dtype=np.int32) * step
 
 
-def _sharpness(pictures: Iterable[tuple[int, _Image]]) -> NDArray[np.float64]:
+def _sharpness(pictures: Iterable[tuple[int, Picture]]) -> Floats:
     """Variance of the Laplacian of pictures, downscaled to reduce noise."""
     small = (grey_within(picture, _SHARPNESS_SIZE) for _, picture in pictures)
     return np.array([float(cv2.Laplacian(grey, cv2.CV_32F).var()) for grey in small])
 
 
-def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:
+def _at_rate(times: Floats, fps: float) -> NDArray[np.int32]:
     """The frames that FFmpeg's fps filter selects: for each tick, the last that rounds to it."""
     half = 0.5 + _ROUNDING
     tick = np.floor(times * fps + half)
@@ -496,7 +496,7 @@ def _at_rate(times: NDArray[np.float64], fps: float) -> NDArray[np.int32]:
     return np.flatnonzero(is_last & (tick < num_ticks)).astype(np.int32)
 
 
-def _evenly_spread(positions: NDArray[np.float64], num_images: int) -> NDArray[np.int32]:
+def _evenly_spread(positions: Floats, num_images: int) -> NDArray[np.int32]:
     """Choose frames evenly by the positions of all frames, which ascend."""
     count = len(positions)
     if num_images > count:
@@ -510,7 +510,7 @@ def _evenly_spread(positions: NDArray[np.float64], num_images: int) -> NDArray[n
     return _distinct(_nearest(positions, wanted), count)
 
 
-def _nearest(positions: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
+def _nearest(positions: Floats, wanted: Floats) -> Ints:
     """Index of the position nearest to each wanted one, the earlier of two; positions ascend."""
     above = np.clip(np.searchsorted(positions, wanted), 1, max(len(positions) - 1, 1))
     if len(positions) == 1:
@@ -519,7 +519,7 @@ def _nearest(positions: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDA
     return np.asarray(np.where(nearer_below, above - 1, above), dtype=np.int64)
 
 
-def _distinct(frames: NDArray[np.int64], count: int) -> NDArray[np.int32]:
+def _distinct(frames: Ints, count: int) -> NDArray[np.int32]:
     """Move ascending frames so that they are distinct and below `count`."""
     index = np.arange(len(frames))
     pushed_up = np.maximum.accumulate(frames - index) + index
@@ -527,9 +527,7 @@ def _distinct(frames: NDArray[np.int64], count: int) -> NDArray[np.int32]:
     return np.asarray(np.minimum(pushed_up, most), dtype=np.int32)
 
 
-def _rotation_field(
-    xy: NDArray[np.float64], motion: NDArray[np.float64], focal: float
-) -> NDArray[np.float64]:
+def _rotation_field(xy: Floats, motion: Floats, focal: float) -> Floats:
     """Motion [n, 2] of the best-fitting rotation at positions [n, 2] from the picture's centre."""
     x, y = xy[:, 0] / focal, xy[:, 1] / focal
     columns = np.empty((len(xy), 2, 3))

@@ -16,7 +16,6 @@ import av
 import av.error
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, VideoError, cannot_write
 from colmap_av1.images.names import (
@@ -25,6 +24,7 @@ from colmap_av1.images.names import (
     pattern_regex,
 )
 from colmap_av1.options.images import check_extension
+from colmap_av1.util.arrays import Picture
 from colmap_av1.util.files import may_read, remove_leftovers, whole_file
 from colmap_av1.util.memory import check_memory
 from colmap_av1.util.spread import evenly_spread
@@ -34,8 +34,6 @@ from colmap_av1.video.display import Display
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
-
-_Image = NDArray[np.uint8]
 
 # Extensions of images that can be read.
 READABLE = {*WRITE_PARAMETERS, ".bmp", ".tif", ".tiff"}
@@ -203,8 +201,8 @@ def write_images(
     *,
     num_threads: int | None = None,
     operating_point: int = 0,
-    change: Callable[[int, _Image], _Image] | None = None,
-    look: Callable[[int, _Image], None] | None = None,
+    change: Callable[[int, Picture], Picture] | None = None,
+    look: Callable[[int, Picture], None] | None = None,
     display: Display | None = None,
     kept: KeptPictures | None = None,
     progress: Callable[[int], None] | None = None,
@@ -251,7 +249,7 @@ def write_images(
         if progress is not None:
             progress(num_kept + num_written)
 
-    def write(shown: tuple[int, _Image]) -> tuple[int, _Image | None]:
+    def write(shown: tuple[int, Picture]) -> tuple[int, Picture | None]:
         index, picture = shown
         picture = change(index, picture) if change is not None else picture
         write_image(wanted[index], picture)
@@ -310,8 +308,8 @@ def write_images(
 
 
 def _pictures(
-    decoded: Iterable[tuple[int, _Image]], wanted: Collection[int]
-) -> Iterator[tuple[int, _Image]]:
+    decoded: Iterable[tuple[int, Picture]], wanted: Collection[int]
+) -> Iterator[tuple[int, Picture]]:
     """Yield the wanted ones of decoded frames, which must have one size."""
     size: tuple[int, ...] | None = None
     last = max(wanted)
@@ -329,7 +327,7 @@ def _pictures(
             return
 
 
-def read_image(path: Path) -> _Image:
+def read_image(path: Path) -> Picture:
     """Read an image file: uint8 [height, width, 3] BGR.
 
     Raises:
@@ -382,7 +380,7 @@ def blur_warning(files: Sequence[Path]) -> str | None:
     return None
 
 
-def _detail(grey: _Image) -> float:
+def _detail(grey: Picture) -> float:
     """Share of the pixels that have detail."""
     height, width = grey.shape
     half = (max(1, width // 2), max(1, height // 2))
@@ -391,7 +389,7 @@ def _detail(grey: _Image) -> float:
     return float(np.mean(cv2.absdiff(grey, again) > _VISIBLE))
 
 
-def _detail_by_direction(grey: _Image) -> list[float]:
+def _detail_by_direction(grey: Picture) -> list[float]:
     """Share of the pixels that have detail along rows, columns and both diagonals."""
     return [
         float(np.mean(np.abs(cv2.filter2D(grey, cv2.CV_32F, kernel)) > _VISIBLE))
@@ -399,7 +397,7 @@ def _detail_by_direction(grey: _Image) -> list[float]:
     ]
 
 
-def grey_within(picture: _Image, longest: int) -> _Image:
+def grey_within(picture: Picture, longest: int) -> Picture:
     """Convert a BGR picture to grey, downscaled if its longer side exceeds `longest` pixels."""
     scale = min(1.0, longest / max(picture.shape[:2]))
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
@@ -430,7 +428,7 @@ def image_size(path: Path) -> tuple[int, int]:
     return size
 
 
-def write_image(path: Path, image: _Image) -> None:
+def write_image(path: Path, image: Picture) -> None:
     """Write an image (BGR), PNG or JPEG by its extension; it appears when it is complete.
 
     Raises:

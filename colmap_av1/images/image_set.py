@@ -15,13 +15,13 @@ from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import read_image
 from colmap_av1.options import ReadOptions
 from colmap_av1.tracks.video_tracks import decodable_frames
+from colmap_av1.util.arrays import Ints, Picture
 from colmap_av1.video.display import Display
 from colmap_av1.video.facts import Video
 from colmap_av1.video.kept_pictures import KeptPictures
 
-Image = NDArray[np.uint8]
 # Yields the pictures of images, given by their indices, in ascending order.
-Pictures = Callable[[list[int]], Iterator[tuple[int, Image]]]
+Pictures = Callable[[list[int]], Iterator[tuple[int, Picture]]]
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ImageSet:
     videos: tuple[str, ...]
     images: ChosenImages
     sequence: NDArray[np.int32]
-    first_frame: NDArray[np.int64]
+    first_frame: Ints
     masks: tuple[Mask | None, ...]
 
     @property
@@ -68,7 +68,7 @@ class ImageSet:
         first, last = np.searchsorted(self.sequence, [sequence, sequence + 1])
         return range(int(first), int(last))
 
-    def some(self, index: Sequence[int] | NDArray[np.int64]) -> ImageSet:
+    def some(self, index: Sequence[int] | Ints) -> ImageSet:
         """Select images by their indices, which must ascend."""
         chosen = np.asarray(index, dtype=np.int64)
         masks = tuple(self.masks[i] for i in chosen)
@@ -146,7 +146,7 @@ class ShownVideo:
 
     def pictures(
         self, num_frames: int, options: ReadOptions, *, wanted: Collection[int], use: str
-    ) -> Iterator[tuple[int, Image]]:
+    ) -> Iterator[tuple[int, Picture]]:
         """The pictures of some frames, see `decodable_frames`."""
         decoded = decodable_frames(
             self.video,
@@ -184,7 +184,7 @@ def pictures_of(
         The pictures after damage of a video are missing, with a warning.
     """
 
-    def pictures(wanted: list[int]) -> Iterator[tuple[int, Image]]:
+    def pictures(wanted: list[int]) -> Iterator[tuple[int, Picture]]:
         left = set(wanted)
         for number, shown in enumerate(videos):
             own = image_set.of_video(number)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.images.choosing import spread_in_parallax
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Ints
 
 # Share of its cells with tracks that a key image has in common with the next one. Three consecutive
 # key images then have half of them in common, which matters since a point needs three observations.
@@ -20,11 +21,11 @@ _MAX_APART = 6
 def key_images(
     tracks: Tracks,
     frames: NDArray[np.int32],
-    always: NDArray[np.bool_],
+    always: Bools,
     *,
     spacing: float,
     num_cells: int,
-) -> NDArray[np.int64]:
+) -> Ints:
     """Choose key images as far apart as tracks allow.
 
     Where tracks are long, for example because the camera moves slowly, key images lie far apart.
@@ -57,7 +58,7 @@ def key_images(
     return np.array(key, dtype=np.int64)
 
 
-def spread_images(tracks: Tracks, num_images: int, key: NDArray[np.int64]) -> NDArray[np.int32]:
+def spread_images(tracks: Tracks, num_images: int, key: Ints) -> NDArray[np.int32]:
     """Choose images of a long video: its key images, and others evenly in parallax.
 
     Args:

@@ -19,6 +19,7 @@ from colmap_av1.images.files import READABLE
 from colmap_av1.images.names import natural_key, pattern_regex
 from colmap_av1.options.images import ImageOptions
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Ints
 from colmap_av1.util.files import is_hidden
 from colmap_av1.util.threads import map_on_threads
 
@@ -349,7 +350,7 @@ class _Unseen:
         self._after = after[np.argsort(tracks.frame[after - 1], kind="stable")]
         self._start = tracks.frame[self._after - 1]
 
-    def at(self, frame: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def at(self, frame: int) -> tuple[Ints, NDArray[np.float32]]:
         """The observations after the gaps that cover a frame, and positions [n, 2] in the frame."""
         tracks = self._tracks
         first, last = np.searchsorted(self._start, [frame - self._longest + 1, frame])

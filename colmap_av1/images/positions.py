@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.photos import Photo
+from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.video.facts import Video, picture_times
 from colmap_av1.video.metadata.places import are_places
 from colmap_av1.video.metadata.positions import Positions, interpolate, read_positions
@@ -30,8 +30,8 @@ class ImagePositions:
         warnings: warnings about the positions.
     """
 
-    places: NDArray[np.float64]
-    gravity: NDArray[np.float64]
+    places: Floats
+    gravity: Floats
     place: tuple[float, float, float] | None
     warnings: tuple[str, ...] = ()
 
@@ -41,7 +41,7 @@ class ImagePositions:
         arrays = self.places.tobytes() + self.gravity.tobytes()
         return hashlib.sha256(arrays + repr(self.place).encode()).hexdigest()
 
-    def some(self, index: NDArray[np.int64]) -> ImagePositions:
+    def some(self, index: Ints) -> ImagePositions:
         """Select images by their indices."""
         return replace(self, places=self.places[index], gravity=self.gravity[index])
 
@@ -85,18 +85,18 @@ def image_positions(
     return ImagePositions(places, gravity, one[0] if no_path else None, tuple(notes))
 
 
-def _times_since_start(video: Video) -> NDArray[np.float64] | None:
+def _times_since_start(video: Video) -> Floats | None:
     """Times in seconds after the first picture of the frames that players show; None if unknown."""
     times = picture_times(video)
     if times is None:
         return None
-    since: NDArray[np.float64] = times - times[0]
+    since: Floats = times - times[0]
     if video.presented is None:
         return since
     return np.asarray(since[video.presented[video.presented < len(since)]])
 
 
-def _places(found: Positions, times: NDArray[np.float64]) -> NDArray[np.float64]:
+def _places(found: Positions, times: Floats) -> Floats:
     # Positions on both sides of the date line are close to each other.
     east = np.unwrap(found.places[:, 1], period=360.0)
     places = np.column_stack([found.places[:, 0], east, found.places[:, 2]])
@@ -105,7 +105,7 @@ def _places(found: Positions, times: NDArray[np.float64]) -> NDArray[np.float64]
     return between
 
 
-def _gravity(found: Positions, times: NDArray[np.float64]) -> NDArray[np.float64]:
+def _gravity(found: Positions, times: Floats) -> Floats:
     between = interpolate(times, found.gravity_times, found.gravity)
     length = np.linalg.norm(between, axis=1, keepdims=True)
     return np.asarray(between / np.where(length > 0, length, np.nan))

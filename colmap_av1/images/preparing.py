@@ -6,9 +6,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.choosing import check_frame_list, existing_images
 from colmap_av1.images.files import (
@@ -37,8 +34,6 @@ from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import UPRIGHT, Display, shown_size, turned_back
 from colmap_av1.video.facts import Video, count_shown
 from colmap_av1.video.unchanged import unchanged
-
-_Image = NDArray[np.uint8]
 
 # Index of the second image of an earlier run whose content is checked. Checking the last one would
 # decode the whole video.

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
 from colmap_av1.images.files import read_image
+from colmap_av1.util.arrays import Bools, Picture
 from colmap_av1.video.display import Display, shown_picture, turned_back
-
-_Image = NDArray[np.uint8]
 
 # Width and height of thumbnails: small enough to hide scaling and JPEG compression, large enough to
 # show the motion between frames.
@@ -34,7 +33,7 @@ _SAME = 5e-5
 
 
 def frames_by_content(
-    files: Sequence[Path], pictures: Iterable[tuple[int, _Image]]
+    files: Sequence[Path], pictures: Iterable[tuple[int, Picture]]
 ) -> tuple[list[int], NDArray[np.int32]]:
     """Find the frames that image files show.
 
@@ -109,7 +108,7 @@ def frames_near(frames: Iterable[int]) -> set[int]:
 
 
 def check_content(
-    files: Sequence[Path], frames: Sequence[int], pictures: Iterable[tuple[int, _Image]]
+    files: Sequence[Path], frames: Sequence[int], pictures: Iterable[tuple[int, Picture]]
 ) -> None:
     """Check that images show their frames rather than neighbouring ones.
 
@@ -143,7 +142,7 @@ def check_content(
         )
 
 
-def is_turned_back(path: Path, pictures: Iterable[tuple[int, _Image]], display: Display) -> bool:
+def is_turned_back(path: Path, pictures: Iterable[tuple[int, Picture]], display: Display) -> bool:
     """Whether an image shows pictures as stored, not as players rotate them.
 
     Args:
@@ -184,7 +183,7 @@ def _check_rivals(
         )
 
 
-def _is_clearly_less(similarity: Any, than: Any) -> NDArray[np.bool_]:
+def _is_clearly_less(similarity: Any, than: Any) -> Bools:
     """Whether one similarity is clearly less than another."""
     return np.asarray((1 - similarity) > _MARGIN * (1 - than) + _SAME / 2)
 
@@ -208,7 +207,7 @@ def _ascending_assignment(similarity: NDArray[np.float32]) -> NDArray[np.int32]:
     return frames
 
 
-def _thumbnail(image: _Image) -> NDArray[np.float32]:
+def _thumbnail(image: Picture) -> NDArray[np.float32]:
     """Grey values of a picture at low resolution, and a constant that makes flat pictures similar.
 
     The grey values have mean 0, and the vector has norm 1.

@@ -25,10 +25,9 @@ from colmap_av1.tracks.video_tracks import (
     times_of_frames,
     track_video,
 )
+from colmap_av1.util.arrays import Picture
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.display import Display, shown_size, turned_back
-
-_Image = NDArray[np.uint8]
 
 # Smallest number of observations of a track if only images are kept.
 MIN_IMAGES = 2
@@ -249,7 +248,7 @@ def decode_pictures(
     *,
     wanted: Collection[int] | None,
     context: RunContext,
-) -> Iterator[tuple[int, _Image]]:
+) -> Iterator[tuple[int, Picture]]:
     """Decode frames that have tracks, with progress in the stage "recognising".
 
     Args:

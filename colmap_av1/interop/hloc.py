@@ -23,6 +23,7 @@ from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_row, matches_from_row
 from colmap_av1.errors import DatabaseError, HlocError, OptionError, cannot_write
 from colmap_av1.options import ExportOptions
+from colmap_av1.util.arrays import Ints
 from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
 from colmap_av1.util.hdf5 import new_hdf5
 from colmap_av1.util.progress import Progress, no_progress
@@ -56,7 +57,7 @@ class HlocMatches:
     """
 
     names: list[str]
-    sizes: NDArray[np.int64]
+    sizes: Ints
     keypoints: list[NDArray[np.float32]]
     pairs: NDArray[np.int32]
     matches: list[NDArray[np.uint32]]

@@ -11,8 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.matching.image_matches import MatchedImages
-
-_Floats = NDArray[np.float64]
+from colmap_av1.util.arrays import Floats
 
 # Focal lengths to try, in units of the longer image side. With longer ones, a rotation looks like
 # a translation along a plane.
@@ -89,7 +88,7 @@ def motion_spread(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
 def depth_evidence(
     keypoints: Sequence[NDArray[np.float32]],
     pairs: NDArray[np.integer],
-    spread: NDArray[np.float64],
+    spread: Floats,
     matches: Callable[[int], NDArray[np.integer]],
     cameras: Sequence[pycolmap.Camera | None],
 ) -> DepthEvidence:
@@ -149,14 +148,14 @@ def depth_of_images(matched: MatchedImages, cameras: Sequence[pycolmap.Camera]) 
     return depth_evidence(xy, matched.pairs, np.array(spread), inliers.__getitem__, cameras)
 
 
-def _centred(xy: NDArray[np.float32], camera: pycolmap.Camera) -> _Floats:
+def _centred(xy: NDArray[np.float32], camera: pycolmap.Camera) -> Floats:
     """Undistorted positions relative to the principal point, in units of the longer image side."""
     focal_length = camera.mean_focal_length() / max(camera.width, camera.height)
     rays = np.asarray(camera.cam_from_img(xy.astype(np.float64)), np.float64)
     return np.asarray(rays[:, :2] * focal_length)
 
 
-def _turn_and_zoom_residuals(a: _Floats, b: _Floats) -> _Floats:
+def _turn_and_zoom_residuals(a: Floats, b: Floats) -> Floats:
     """Fit a rotation and zoom to matches for each focal length, and return the residuals.
 
     Args:
@@ -213,7 +212,7 @@ def _turn_and_zoom_residuals(a: _Floats, b: _Floats) -> _Floats:
     return np.asarray(distance / np.maximum(1.0, np.exp(zoom))[:, None])
 
 
-def _rotations(vectors: _Floats) -> _Floats:
+def _rotations(vectors: Floats) -> Floats:
     """Rotation matrices [n, 3, 3] of rotation vectors [n, 3]."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - slow to import
 

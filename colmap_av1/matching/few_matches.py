@@ -12,6 +12,7 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.names import natural_order
 from colmap_av1.matching.gaps import Gap
 from colmap_av1.matching.image_matches import MatchedImages, used_pairs
+from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.util.grouping import sums_beside_gaps
 
 # A gap has few matches if they are fewer than this share of the usual number. Camera jerks leave 5
@@ -76,7 +77,7 @@ def few_match_gaps(
     return tuple(found)
 
 
-def _share_of_usual(across: NDArray[np.int64]) -> NDArray[np.float64]:
+def _share_of_usual(across: Ints) -> Floats:
     """Matches across each gap over the most across nearby gaps, on the side where that is less.
 
     The comparison stops at a gap without matches, because another model begins there. The share of

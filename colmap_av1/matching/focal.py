@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_models import poselib_camera
-
-_Floats = NDArray[np.float64]
+from colmap_av1.util.arrays import Floats
 
 # Focal lengths to try, in units of the longer image side: fields of view from 127 to 18 degrees.
 _SHORTEST, _LONGEST, _NUM_TRIED = 0.25, 3.2, 17
@@ -140,13 +139,13 @@ def estimate_focal_length(
     return math.exp(found)
 
 
-def _are_on_line(x: _Floats) -> bool:
+def _are_on_line(x: Floats) -> bool:
     """Whether points, in pixels, lie on a line, so that they determine no pose."""
     across = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)[1]
     return bool(across < math.sqrt(len(x)))
 
 
-def _as_pinhole(x: _Floats, focal_length: float) -> _Floats:
+def _as_pinhole(x: Floats, focal_length: float) -> Floats:
     """Map points of an equidistant fisheye image to a pinhole image with the same focal length."""
     away = np.hypot(*x.T)
     angle = np.minimum(away / focal_length, _WIDEST)
@@ -157,7 +156,7 @@ def _widest_pairs(
     keypoints: Sequence[ImageKeypoints],
     pairs: NDArray[np.int32],
     matches: Sequence[NDArray[np.uint32]],
-    shape: _Floats,
+    shape: Floats,
 ) -> list[int]:
     """Find the pair with the most parallax in each part of the video, in order."""
     num_parts = round(np.clip(len(keypoints) / _IMAGES_PER_PAIR, _LEAST_PAIRS, _MOST_PAIRS))
@@ -182,7 +181,7 @@ def _median(values: NDArray[Any]) -> NDArray[Any]:
     return np.asarray((ordered[half] + ordered[-half - 1]) / 2)
 
 
-def pose_loss(xa: _Floats, xb: _Floats, focal_length: float, seed: int) -> float:
+def pose_loss(xa: Floats, xb: Floats, focal_length: float, seed: int) -> float:
     """Mean robust loss of the epipolar errors of a pair for one focal length."""
     camera = poselib_camera(focal_length)
     some = slice(_NUM_SEARCHED)
@@ -195,7 +194,7 @@ def pose_loss(xa: _Floats, xb: _Floats, focal_length: float, seed: int) -> float
     return float(refined["cost"]) / (scale * scale * len(xa))
 
 
-def lowest(at: _Floats, value: _Floats) -> float | None:
+def lowest(at: Floats, value: Floats) -> float | None:
     """Find the minimum of a curve with a parabola, skipping NaN; None if it is at an end."""
     k = int(np.nanargmin(value))
     if k in (0, len(at) - 1):

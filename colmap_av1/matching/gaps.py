@@ -17,6 +17,7 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.options import LinkOptions
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.spread import evenly_spread
 
 # Number of frames on either side that a frame is compared with.
@@ -72,9 +73,7 @@ class Gap:
     share: float = 1.0
 
 
-def low_inter_frames(
-    inter_share: NDArray[np.float32], *, certain: bool = False
-) -> NDArray[np.bool_]:
+def low_inter_frames(inter_share: NDArray[np.float32], *, certain: bool = False) -> Bools:
     """Find frames whose motion is doubtful because few units are inter coded.
 
     Args:
@@ -100,7 +99,7 @@ def low_inter_frames(
 
 def low_inter_gaps(
     inter_share: NDArray[np.float32], frames: NDArray[np.int32], *, certain: bool = False
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Find gaps between images that contain a frame with a low inter share.
 
     Args:
@@ -115,7 +114,7 @@ def low_inter_gaps(
     return np.asarray(so_far[frames[1:] + 1] > so_far[frames[:-1] + 1])
 
 
-def fast_frames(tracks: Tracks) -> NDArray[np.bool_]:
+def fast_frames(tracks: Tracks) -> Bools:
     """Find frames in which most tracks are short, because the camera turns or moves fast.
 
     Args:
@@ -128,7 +127,7 @@ def fast_frames(tracks: Tracks) -> NDArray[np.bool_]:
     count = tracks.num_frames
     first, last = tracks.frame[tracks.offsets[:-1]], tracks.frame[tracks.offsets[1:] - 1]
 
-    def num_seen(first: NDArray[np.int32], last: NDArray[np.int32]) -> NDArray[np.int64]:
+    def num_seen(first: NDArray[np.int32], last: NDArray[np.int32]) -> Ints:
         change = (
             np.bincount(first, minlength=count) - np.bincount(last + 1, minlength=count)[:count]
         )
@@ -163,7 +162,7 @@ def should_examine_pictures(
     frames: NDArray[np.int32],
     tracks: Tracks,
     *,
-    fast: NDArray[np.bool_],
+    fast: Bools,
     links: LinkOptions,
     min_length: int,
 ) -> bool:
@@ -177,9 +176,7 @@ def should_examine_pictures(
     return links.links == "sift" or (links.links == "auto" and bool(lacks_tracks or is_doubtful))
 
 
-def probed_gaps(
-    inter_share: NDArray[np.float32], low: NDArray[np.bool_], options: LinkOptions
-) -> list[int]:
+def probed_gaps(inter_share: NDArray[np.float32], low: Bools, options: LinkOptions) -> list[int]:
     """Choose gaps at which to compare motion with the pictures, to decide whether to trust it.
 
     Empty if most units are inter-coded. If the camera is too fast for the encoder's motion search,
@@ -203,8 +200,8 @@ class SuspectGaps:
         probes: other gaps, a sample of all gaps of their video.
     """
 
-    certain: NDArray[np.bool_]
-    maybe: NDArray[np.bool_]
+    certain: Bools
+    maybe: Bools
     probes: list[int]
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import take_rows
 from colmap_av1.matching.image_matches import MatchedImages
@@ -15,10 +14,9 @@ from colmap_av1.matching.mapper_limits import (
     POINT_MIN_ANGLE,
     REGISTRATION_MIN_INLIERS,
 )
+from colmap_av1.util.arrays import Bools, Floats
 from colmap_av1.util.graphs import connected_components
 from colmap_av1.util.grouping import grouped
-
-_Floats = NDArray[np.float64]
 
 
 class Growth:
@@ -46,7 +44,7 @@ class Growth:
         self,
         matched: MatchedImages,
         cameras: Sequence[pycolmap.Camera],
-        known: Sequence[Sequence[_Floats | None]],
+        known: Sequence[Sequence[Floats | None]],
     ) -> None:
         self._offsets = np.cumsum([0, *(len(own.xy) for own in matched.keypoints)])
         edges = [
@@ -74,7 +72,7 @@ class Growth:
         order, self._bounds = grouped(self._track, self._num_tracks)
         self._views = views[order]
 
-    def registered(self, pair: Sequence[int], max_images: int | None = None) -> NDArray[np.bool_]:
+    def registered(self, pair: Sequence[int], max_images: int | None = None) -> Bools:
         """Which images the mapper registers.
 
         Args:

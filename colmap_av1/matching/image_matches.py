@@ -25,6 +25,7 @@ from colmap_av1.matching.two_view_geometry import UNUSED_CONFIGS, TwoViewConfig,
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.graphs import connected_components
 from colmap_av1.util.progress import progress_in
 from colmap_av1.util.run_context import RunContext
@@ -45,7 +46,7 @@ class PairedImages:
     matches: list[NDArray[np.uint32]]
 
     @property
-    def track_lengths(self) -> NDArray[np.int64]:
+    def track_lengths(self) -> Ints:
         """Number of images that observe each track of the keypoints."""
         counts = np.bincount(np.concatenate([k.track for k in self.keypoints]))
         return counts[counts > 0].astype(np.int64)
@@ -190,7 +191,7 @@ def _is_forward_motion(
     return bool(along_axis) and float(np.median(along_axis)) >= INITIAL_MAX_FORWARD_MOTION
 
 
-def _translation(geometry: TwoViewGeometry, camera: pycolmap.Camera) -> NDArray[np.float64] | None:
+def _translation(geometry: TwoViewGeometry, camera: pycolmap.Camera) -> Floats | None:
     """Direction of the first camera from the second, float64 [3], up to its sign.
 
     None if it is not known.
@@ -205,7 +206,7 @@ def _translation(geometry: TwoViewGeometry, camera: pycolmap.Camera) -> NDArray[
     return np.asarray(direction / np.linalg.norm(direction))
 
 
-def used_pairs(matched: MatchedImages) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def used_pairs(matched: MatchedImages) -> tuple[Bools, Ints]:
     """Return which pairs mappers use, bool [m], and the inliers of each pair, int64 [m]."""
     counts = np.array([len(g.inlier_matches) for g in matched.geometries], dtype=np.int64)
     configs = [geometry.config for geometry in matched.geometries]

@@ -10,6 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.matching.mapper_limits import InitialLimits
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.colmap_log import only_errors
 
 # Intrinsics have diverged if the focal length changes by more than this factor, or a distortion
@@ -29,7 +30,7 @@ class InitialPairTrial:
         diverged: whether the intrinsics have diverged.
     """
 
-    cam2_from_cam1: NDArray[np.float64]
+    cam2_from_cam1: Floats
     diverged: bool
 
 

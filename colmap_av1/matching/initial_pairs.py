@@ -33,10 +33,9 @@ from colmap_av1.matching.pair_poses import (
     triangulation_angle,
     wrong_angle,
 )
+from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.progress import Clock
 from colmap_av1.util.spread import evenly_spread
-
-_Floats = NDArray[np.float64]
 
 # If no pair meets the mapper's limits for an initial pair, it halves the number of inliers, then
 # the angle.
@@ -80,7 +79,7 @@ def prepare_start(
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
     clock: Clock,
-    known: Sequence[Sequence[_Floats | None]] = (),
+    known: Sequence[Sequence[Floats | None]] = (),
 ) -> PreparedStart:
     """Limit the inliers of pairs with which the mapper should not begin, and choose its limits.
 
@@ -179,7 +178,7 @@ def with_demoted(
     return replace(matched, geometries=geometries)
 
 
-def _num_inliers(matched: MatchedImages) -> NDArray[np.int64]:
+def _num_inliers(matched: MatchedImages) -> Ints:
     """Number of inliers of each pair, int64 [num_pairs]."""
     return np.array([len(own.inlier_matches) for own in matched.geometries], np.int64)
 
@@ -204,26 +203,26 @@ class _Candidates:
             None if it is not known.
     """
 
-    count: NDArray[np.int64]
-    angle: _Floats
-    along: _Floats
-    known_along: _Floats
-    is_wrong: NDArray[np.bool_]
-    is_sound: NDArray[np.bool_]
-    is_far: NDArray[np.bool_]
-    known_pose: list[_Floats | None]
+    count: Ints
+    angle: Floats
+    along: Floats
+    known_along: Floats
+    is_wrong: Bools
+    is_sound: Bools
+    is_far: Bools
+    known_pose: list[Floats | None]
 
     @staticmethod
     def of(
         matched: MatchedImages,
         cameras: Sequence[pycolmap.Camera],
-        known: Sequence[Sequence[_Floats | None]],
+        known: Sequence[Sequence[Floats | None]],
     ) -> _Candidates:
         """Look at the poses of all pairs."""
         count = _num_inliers(matched)
         angle, along, known_along = np.full((3, len(count)), np.nan)
         is_wrong = np.zeros(len(count), np.bool_)
-        poses: list[_Floats | None] = [None] * len(count)
+        poses: list[Floats | None] = [None] * len(count)
         for k in np.flatnonzero(count >= _MIN_INLIERS).tolist():
             pair, geometry = matched.pairs[k].tolist(), matched.geometries[k]
             some = some_inliers(matched, cameras, pair, geometry)
@@ -245,7 +244,7 @@ class _Candidates:
         is_far = are_far(matched.pairs)
         return _Candidates(count, angle, along, known_along, is_wrong, is_sound, is_far, poses)
 
-    def certain(self, limits: InitialLimits) -> NDArray[np.bool_]:
+    def certain(self, limits: InitialLimits) -> Bools:
         """Whether the mapper certainly accepts each pair, bool [num_pairs]."""
         is_certain = self.is_sound & self.possible(limits)
         is_certain &= self.count >= INITIAL_MARGIN * limits.init_min_num_inliers
@@ -255,7 +254,7 @@ class _Candidates:
             is_certain &= along < limits.init_max_forward_motion - INITIAL_FORWARD_TOLERANCE
         return is_certain
 
-    def possible(self, limits: InitialLimits) -> NDArray[np.bool_]:
+    def possible(self, limits: InitialLimits) -> Bools:
         """Whether the mapper may accept each pair, bool [num_pairs]."""
         is_possible = self.count >= limits.init_min_num_inliers
         is_possible &= self.angle >= _WIDE_SHARE * limits.init_min_tri_angle
@@ -388,9 +387,7 @@ class _Search:
             if first is None or len(bad) == num_before:
                 return bad, first is not None
 
-    def _order(
-        self, count: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def _order(self, count: Ints) -> tuple[Ints, Ints, Ints]:
         """The pairs in the order in which the mapper tries them.
 
         It tries the images by their number of matches, each with all others by the number of
@@ -444,12 +441,12 @@ class _Search:
         return not is_wrong_rotation(begun.cam2_from_cam1[:, :3], pose[:, :3], angle)
 
 
-def are_far(pairs: NDArray[np.int32]) -> NDArray[np.bool_]:
+def are_far(pairs: NDArray[np.int32]) -> Bools:
     """Whether the images of each pair, int32 [num_pairs, 2], are no neighbours."""
     return np.asarray(pairs[:, 1] - pairs[:, 0] > _NEIGHBOURS)
 
 
-def _known_pose(models: Sequence[Sequence[_Floats | None]], pair: Sequence[int]) -> _Floats | None:
+def _known_pose(models: Sequence[Sequence[Floats | None]], pair: Sequence[int]) -> Floats | None:
     """The pose of the second camera relative to the first, float64 [3, 4]; None if not known.
 
     The translation has length 1.

@@ -25,6 +25,7 @@ from colmap_av1.matching.links.link_images import link_images
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.tracks import Tracks, least_length
+from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.run_context import RunContext
 
 
@@ -42,7 +43,7 @@ class SelectedTracks:
     path: Path
     tracks: Tracks
     inter_share: NDArray[np.float32]
-    fast: NDArray[np.bool_]
+    fast: Bools
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class ImageMatches:
     matched: MatchedImages
     links: LinkReport
     link_tracks: Tracks
-    track_lengths: NDArray[np.int64]
+    track_lengths: Ints
     depth: DepthEvidence
     warnings: tuple[str, ...]
 

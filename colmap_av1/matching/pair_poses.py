@@ -8,13 +8,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewGeometry
 from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
-
-_Floats = NDArray[np.float64]
+from colmap_av1.util.arrays import Floats
 
 # About this many inliers decide as well as all of them.
 _NUM_SOME = 64
@@ -43,10 +41,10 @@ class PairInliers:
     """
 
     cameras: tuple[pycolmap.Camera, pycolmap.Camera]
-    x: tuple[_Floats, _Floats]
+    x: tuple[Floats, Floats]
 
     @property
-    def rays(self) -> list[_Floats]:
+    def rays(self) -> list[Floats]:
         """Unit vectors to the inliers, float64 [3, n] of each image."""
         rays = [np.vstack([own, np.ones(own.shape[1])]) for own in self.x]
         return [own / np.linalg.norm(own, axis=0) for own in rays]
@@ -69,7 +67,7 @@ def some_inliers(
     return PairInliers((cameras[pair[0]], cameras[pair[1]]), (a[is_known].T, b[is_known].T))
 
 
-def pair_pose(geometry: TwoViewGeometry, inliers: PairInliers) -> _Floats | None:
+def pair_pose(geometry: TwoViewGeometry, inliers: PairInliers) -> Floats | None:
     """The pose of a pair from its two-view geometry, float64 [3, 4]; None if it has no matrix."""
     if geometry.qvec is not None and geometry.tvec is not None:
         rotation = pycolmap.Rotation3d(np.roll(geometry.qvec, -1)).matrix()
@@ -83,14 +81,14 @@ def pair_pose(geometry: TwoViewGeometry, inliers: PairInliers) -> _Floats | None
     return None if E is None else _pose_of_essential(E, inliers)
 
 
-def _pose_of_homography(H: _Floats, inliers: PairInliers) -> _Floats:
+def _pose_of_homography(H: Floats, inliers: PairInliers) -> Floats:
     """Decompose a homography into a pose as COLMAP's mapper does, float64 [3, 4]."""
     matrices = [camera.calibration_matrix() for camera in inliers.cameras]
     found = pycolmap.pose_from_homography_matrix(H, *matrices, *(own.T for own in inliers.rays))
     return np.asarray(found["cam2_from_cam1"].matrix())
 
 
-def rotations_of_homography(geometry: TwoViewGeometry, inliers: PairInliers) -> list[_Floats]:
+def rotations_of_homography(geometry: TwoViewGeometry, inliers: PairInliers) -> list[Floats]:
     """The rotations, float64 [3, 3], that the homography of a flat pair allows.
 
     With two of them, nearly all points are in front of both cameras: the mapper may choose either.
@@ -108,9 +106,7 @@ def rotations_of_homography(geometry: TwoViewGeometry, inliers: PairInliers) -> 
     ]
 
 
-def wrong_angle(
-    rotations: Sequence[_Floats], known: _Floats, rays: Sequence[_Floats]
-) -> float | None:
+def wrong_angle(rotations: Sequence[Floats], known: Floats, rays: Sequence[Floats]) -> float | None:
     """Largest triangulation angle in degrees of rotations that contradict the known one."""
     angles = [(triangulation_angle(rotation, rays), rotation) for rotation in rotations]
     return max(
@@ -119,7 +115,7 @@ def wrong_angle(
     )
 
 
-def _pose_of_essential(E: _Floats, inliers: PairInliers) -> _Floats:
+def _pose_of_essential(E: Floats, inliers: PairInliers) -> Floats:
     """Decompose an essential matrix into the pose with the most points in front of both cameras.
 
     Returns float64 [3, 4].
@@ -129,13 +125,13 @@ def _pose_of_essential(E: _Floats, inliers: PairInliers) -> _Floats:
     return np.column_stack([rotation, translation])
 
 
-def triangulation_angle(rotation: _Floats, rays: Sequence[_Floats]) -> float:
+def triangulation_angle(rotation: Floats, rays: Sequence[Floats]) -> float:
     """Median triangulation angle of matches in degrees, given the rotation to the second camera."""
     cosine = ((rotation @ rays[0]) * rays[1]).sum(axis=0)
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
 
 
-def is_wrong_rotation(rotation: _Floats, known: _Floats, angle: float) -> bool:
+def is_wrong_rotation(rotation: Floats, known: Floats, angle: float) -> bool:
     """Whether a rotation contradicts the known one, given the triangulation angle in degrees."""
     cosine = (np.trace(rotation @ known.T) - 1.0) / 2.0
     return bool(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) > _WRONG * angle)
@@ -156,6 +152,6 @@ def contradicted_angle(geometry: TwoViewGeometry, inliers: PairInliers) -> float
     return angle if is_wrong else None
 
 
-def _error(E: _Floats, x: Sequence[_Floats]) -> float:
+def _error(E: Floats, x: Sequence[Floats]) -> float:
     """A high quantile of the Sampson errors, in focal lengths."""
     return float(np.quantile(sampson_error(E, x[0], x[1]), _ERROR_QUANTILE))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError
 from colmap_av1.options import PairOptions
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.grouping import grouped
 
 # Spans up to this many images are paired at every image. Longer spans are paired at every n-th
@@ -36,7 +37,7 @@ class ImageKeypoints:
 
     frame: int
     xy: NDArray[np.float32]
-    track: NDArray[np.int64]
+    track: Ints
 
 
 def next_track(keypoints: Sequence[ImageKeypoints]) -> int:
@@ -218,9 +219,7 @@ def _count_shared(a: ImageKeypoints, b: ImageKeypoints) -> int:
     return int(np.count_nonzero(_indices_in(b, a)[1]))
 
 
-def _indices_in(
-    other: ImageKeypoints, own: ImageKeypoints
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _indices_in(other: ImageKeypoints, own: ImageKeypoints) -> tuple[Ints, Bools]:
     """Where another image observes the tracks of an image.
 
     Returns:

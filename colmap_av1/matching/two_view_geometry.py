@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-_Floats = NDArray[np.float64]
+from colmap_av1.util.arrays import Floats
 
 
 class TwoViewConfig(IntEnum):
@@ -57,8 +57,8 @@ class TwoViewGeometry:
 
     config: TwoViewConfig
     inlier_matches: NDArray[np.uint32]
-    E: _Floats | None = None
-    F: _Floats | None = None
-    H: _Floats | None = None
-    qvec: _Floats | None = None
-    tvec: _Floats | None = None
+    E: Floats | None = None
+    F: Floats | None = None
+    H: Floats | None = None
+    qvec: Floats | None = None
+    tvec: Floats | None = None

@@ -15,12 +15,10 @@ from typing import Any
 
 import numpy as np
 import poselib
-from numpy.typing import NDArray
 
 from colmap_av1.options import VerifyOptions
 from colmap_av1.options.matching import MIN_MATCHES
-
-_Floats = NDArray[np.float64]
+from colmap_av1.util.arrays import Bools, Floats, Ints
 
 # Fewest iterations of a robust estimator; it runs more if few matches are inliers.
 _MIN_ITERATIONS = 15
@@ -59,8 +57,8 @@ class Model:
         pose: PoseLib's pose of an essential matrix.
     """
 
-    matrix: _Floats | None
-    inliers: NDArray[np.bool_]
+    matrix: Floats | None
+    inliers: Bools
     count: int
     pose: Any = None
 
@@ -76,17 +74,17 @@ class MatchedPoints:
         spread_b: float64 [2, k] the matching points of `b`.
     """
 
-    a: _Floats
-    b: _Floats
-    spread_a: _Floats
-    spread_b: _Floats
+    a: Floats
+    b: Floats
+    spread_a: Floats
+    spread_b: Floats
 
-    def first(self, count: int) -> tuple[_Floats, _Floats]:
+    def first(self, count: int) -> tuple[Floats, Floats]:
         """The first matches of the sample, float64 [2, m] in each image."""
         return self.spread_a[:, :count], self.spread_b[:, :count]
 
 
-def spread_points(a: _Floats, b: _Floats, order: NDArray[np.int64]) -> MatchedPoints:
+def spread_points(a: Floats, b: Floats, order: Ints) -> MatchedPoints:
     """Select a sample of matched points.
 
     Args:
@@ -157,7 +155,7 @@ def find_pose(points: MatchedPoints, search: Search, focal_lengths: tuple[float,
 
     cameras = [poselib_camera(focal_length) for focal_length in focal_lengths]
 
-    def refine(pose: Any, xa: _Floats, xb: _Floats) -> Model:
+    def refine(pose: Any, xa: Floats, xb: Floats) -> Model:
         pose, _ = poselib.refine_relative_pose(xa.T, xb.T, pose, *cameras, _REFINEMENT)
         tested = _test(epipolar_inliers, _essential(pose, *focal_lengths), points, search)
         return replace(tested, pose=pose)
@@ -175,7 +173,7 @@ def find_fundamental(points: MatchedPoints, search: Search) -> Model:
     if points.spread_a.shape[1] < MIN_MATCHES:
         return _no_model(points)
 
-    def refine(F: _Floats, xa: _Floats, xb: _Floats) -> Model:
+    def refine(F: Floats, xa: Floats, xb: Floats) -> Model:
         F, _ = poselib.refine_fundamental(xa.T, xb.T, F, _REFINEMENT)
         return _test(epipolar_inliers, F, points, search)
 
@@ -231,7 +229,7 @@ def planar_share(options: VerifyOptions) -> float:
 
 
 def _again_on_inliers(
-    refine: Callable[[Any, _Floats, _Floats], Model],
+    refine: Callable[[Any, Floats, Floats], Model],
     found: Model,
     model: Any,
     points: MatchedPoints,
@@ -265,13 +263,13 @@ def poselib_camera(focal_length: float) -> dict[str, Any]:
     return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": params}
 
 
-def _essential(pose: Any, focal_a: float, focal_b: float) -> _Floats:
+def _essential(pose: Any, focal_a: float, focal_b: float) -> Floats:
     """The essential matrix of a pose, on undistorted pixels relative to the principal points."""
     E = essential_of_poses(np.eye(3, 4), np.asarray(pose.Rt))
     return np.asarray(E / np.outer([focal_b, focal_b, 1.0], [focal_a, focal_a, 1.0]))
 
 
-def _linear_fundamental(xa: _Floats, xb: _Floats) -> _Floats:
+def _linear_fundamental(xa: Floats, xb: Floats) -> Floats:
     """Fit the fundamental matrix by least squares (Hartley and Zisserman, 11.1 and 11.4).
 
     A second fit weights each match for its Sampson error, and reduces the weight of errors above a
@@ -288,7 +286,7 @@ def _linear_fundamental(xa: _Floats, xb: _Floats) -> _Floats:
     return np.asarray(to_b.T @ F @ to_a)
 
 
-def _normalised(x: _Floats) -> tuple[_Floats, _Floats]:
+def _normalised(x: Floats) -> tuple[Floats, Floats]:
     """Normalise points [2, n]; return them homogeneous, with the normalising matrix [3, 3]."""
     centre = x.sum(axis=1) / x.shape[1]
     moved = x - centre[:, None]
@@ -299,14 +297,14 @@ def _normalised(x: _Floats) -> tuple[_Floats, _Floats]:
     return _homogeneous(moved * scale), transform
 
 
-def _homogeneous(x: _Floats) -> _Floats:
+def _homogeneous(x: Floats) -> Floats:
     """Append a third coordinate 1 to points [2, n], giving [3, n]."""
     extended = np.ones((3, x.shape[1]))
     extended[:2] = x
     return extended
 
 
-def _affine_fit(xa: _Floats, xb: _Floats) -> _Floats:
+def _affine_fit(xa: Floats, xb: Floats) -> Floats:
     """Fit the affine map from `xa` to `xb` by least squares, as a 3x3 matrix."""
     a = _homogeneous(xa)
     square = a @ a.T
@@ -320,7 +318,7 @@ def _no_model(points: MatchedPoints) -> Model:
 
 
 def _test(
-    inliers_of: Callable[..., NDArray[np.bool_]], matrix: Any, points: MatchedPoints, search: Search
+    inliers_of: Callable[..., Bools], matrix: Any, points: MatchedPoints, search: Search
 ) -> Model:
     """Scale a matrix to unit norm and find its inliers; no model unless it is finite and not 0."""
     matrix = np.asarray(matrix, dtype=np.float64)
@@ -332,19 +330,19 @@ def _test(
     return Model(matrix, inliers, int(np.count_nonzero(inliers)))
 
 
-def epipolar_inliers(F: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> NDArray[np.bool_]:
+def epipolar_inliers(F: Floats, xa: Floats, xb: Floats, max_error: float) -> Bools:
     """Matches whose Sampson error (Hartley and Zisserman, eq. 11.9) is within `max_error`."""
     algebraic, gradient = epipolar_terms(F, xa, xb)
     return np.asarray(algebraic**2 <= max_error**2 * gradient)
 
 
-def sampson_error(F: _Floats, xa: _Floats, xb: _Floats) -> _Floats:
+def sampson_error(F: Floats, xa: Floats, xb: Floats) -> Floats:
     """Sampson error of matches [2, n] (Hartley and Zisserman, eq. 11.9), float64 [n]."""
     algebraic, gradient = epipolar_terms(F, xa, xb)
     return np.asarray(np.abs(algebraic) / np.sqrt(np.maximum(gradient, _SMALLEST)))
 
 
-def epipolar_terms(F: _Floats, xa: _Floats, xb: _Floats) -> tuple[_Floats, _Floats]:
+def epipolar_terms(F: Floats, xa: Floats, xb: Floats) -> tuple[Floats, Floats]:
     """Algebraic error of matches [2, n], and the square of its gradient, float64 [n] each."""
     lines_b = F[:, :2] @ xa + F[:, 2:]
     lines_a = F.T[:2, :2] @ xb + F.T[:2, 2:]
@@ -353,14 +351,14 @@ def epipolar_terms(F: _Floats, xa: _Floats, xb: _Floats) -> tuple[_Floats, _Floa
     return algebraic, gradient
 
 
-def essential_of_poses(a: _Floats, b: _Floats) -> _Floats:
+def essential_of_poses(a: Floats, b: Floats) -> Floats:
     """The essential matrix of two images from their poses [3, 4], x_cam = R x_world + t."""
     rotation = b[:, :3] @ a[:, :3].T
     x, y, z = b[:, 3] - rotation @ a[:, 3]
     return np.asarray(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation)
 
 
-def transfer_inliers(H: _Floats, xa: _Floats, xb: _Floats, max_error: float) -> NDArray[np.bool_]:
+def transfer_inliers(H: Floats, xa: Floats, xb: Floats, max_error: float) -> Bools:
     """Matches that H maps to within `max_error` of their position in the second image."""
     mapped = H[:, :2] @ xa + H[:, 2:]
     # Multiplied by the third coordinate, so that points at infinity cause no division by zero.

@@ -31,11 +31,10 @@ from colmap_av1.matching.two_view_models import (
 )
 from colmap_av1.options import VerifyOptions
 from colmap_av1.options.matching import MIN_MATCHES
+from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.util.digests import seed_of
 from colmap_av1.util.threads import map_on_threads
-
-_Floats = NDArray[np.float64]
 
 # Number of pairs that justifies another thread. Threads wait for the interpreter between PoseLib's
 # steps: two threads use a third more CPU time to finish a tenth to a quarter sooner.
@@ -138,9 +137,9 @@ class _View:
 
     camera: pycolmap.Camera
     xy: NDArray[np.float32]
-    flat: _Floats | None
+    flat: Floats | None
     focal: float
-    to_flat: _Floats
+    to_flat: Floats
     rank: NDArray[np.int32]
 
 
@@ -163,7 +162,7 @@ def _view(keypoints: ImageKeypoints, camera: pycolmap.Camera, seed: int) -> _Vie
     return _View(camera, keypoints.xy, flat, focal, to_flat, rank)
 
 
-def _spread_order(x: _Floats, size: tuple[int, int], seed: int) -> NDArray[np.int32]:
+def _spread_order(x: Floats, size: tuple[int, int], seed: int) -> NDArray[np.int32]:
     """Order points so that any beginning of the order is spread over the image.
 
     The image is divided into cells. The order takes one random point of every cell, then a second
@@ -223,7 +222,7 @@ def _degenerate() -> TwoViewGeometry:
 
 
 def _verify_calibrated(
-    a: _View, b: _View, matches: NDArray[np.uint32], order: NDArray[np.int64], search: Search
+    a: _View, b: _View, matches: NDArray[np.uint32], order: Ints, search: Search
 ) -> TwoViewGeometry:
     """The geometry of a pair with known focal lengths."""
     options = search.options
@@ -287,14 +286,14 @@ def _inliers(matches: NDArray[np.uint32], model: Model) -> NDArray[np.uint32]:
     return chosen.astype(np.uint32, copy=False)
 
 
-def _pixels(a: _View, b: _View, matches: NDArray[np.uint32]) -> tuple[_Floats, _Floats]:
+def _pixels(a: _View, b: _View, matches: NDArray[np.uint32]) -> tuple[Floats, Floats]:
     """The matched keypoints of both images, float64 [2, n] each."""
     xa, xb = a.xy.take(matches[:, 0], axis=0), b.xy.take(matches[:, 1], axis=0)
     return np.ascontiguousarray(xa.T, np.float64), np.ascontiguousarray(xb.T, np.float64)
 
 
 def _verify_uncalibrated(
-    a: _View, b: _View, matches: NDArray[np.uint32], order: NDArray[np.int64], search: Search
+    a: _View, b: _View, matches: NDArray[np.uint32], order: Ints, search: Search
 ) -> TwoViewGeometry:
     """The geometry of a pair without known focal lengths.
 
@@ -321,12 +320,12 @@ def _verify_uncalibrated(
     )
 
 
-def _on_rays(E: _Floats, a: _View, b: _View) -> _Floats:
+def _on_rays(E: Floats, a: _View, b: _View) -> Floats:
     """Convert the essential matrix of `find_pose` to normalised coordinates."""
     return _unit(E * np.outer([b.focal, b.focal, 1.0], [a.focal, a.focal, 1.0]))
 
 
-def _unit(matrix: _Floats) -> _Floats:
+def _unit(matrix: Floats) -> Floats:
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
@@ -337,7 +336,7 @@ def agreeing_matches(
     cameras: tuple[pycolmap.Camera, pycolmap.Camera],
     *,
     max_error: float,
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Test which matches agree with the two-view geometry of their image pair.
 
     Args:

@@ -19,6 +19,7 @@ from colmap_av1 import _core
 from colmap_av1.errors import BitstreamError, LimitError, OptionError
 from colmap_av1.motion.frame_motion import BLOCK, FrameMotion
 from colmap_av1.options import ReadOptions
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.cpus import threads_or_cpus
 from colmap_av1.video.container import check_process, open_stream
 
@@ -136,9 +137,7 @@ def first_showings(video: str | PathLike[str], options: ReadOptions) -> NDArray[
     return first[number].astype(np.int32)
 
 
-def frame_times(
-    video: str | PathLike[str], options: ReadOptions = ReadOptions()
-) -> NDArray[np.float64] | None:
+def frame_times(video: str | PathLike[str], options: ReadOptions = ReadOptions()) -> Floats | None:
     """Presentation times of the frames that the headers of a stream show, in output order.
 
     Returns:

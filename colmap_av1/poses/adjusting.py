@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.cameras import as_radial
 from colmap_av1.geometry.colmap_model import (
@@ -28,6 +27,7 @@ from colmap_av1.options import ReconstructOptions
 from colmap_av1.options.camera import DEFAULT_MODEL
 from colmap_av1.poses.mapper import ADJUSTMENT_STEPS, ADJUSTMENT_TOLERANCE, adjust_model
 from colmap_av1.poses.run import Run
+from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.colmap_log import only_errors
 from colmap_av1.util.spread import evenly_spread
 
@@ -80,7 +80,7 @@ class Adjusted:
     """
 
     model: PosedModel
-    kept_points: NDArray[np.int64]
+    kept_points: Ints
 
 
 def adjust_posed(
@@ -210,7 +210,7 @@ def with_second_distortion(run: Run, model: PosedModel) -> PosedModel:
     return radial if is_better and max(distortion) <= _MAX_DISTORTION else model
 
 
-def mean_cost(errors: NDArray[np.float64]) -> float:
+def mean_cost(errors: Floats) -> float:
     """Mean Cauchy loss of errors in pixels, divided by the square of its scale."""
     return float(np.log1p((errors / LOSS_SCALES[-1]) ** 2).mean())
 
@@ -264,7 +264,7 @@ def focal_length_errors(model: PosedModel) -> dict[int, float]:
     return errors
 
 
-def used_observations(points: ModelPoints, num_images: int, mean: float) -> NDArray[np.bool_]:
+def used_observations(points: ModelPoints, num_images: int, mean: float) -> Bools:
     """Choose about `mean` observations per image for the adjustment.
 
     Points with many observations each keep the same number, evenly spread over their images. Points

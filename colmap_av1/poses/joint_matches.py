@@ -44,6 +44,7 @@ from colmap_av1.poses.track_stage import VideoTracks, pose_tracks
 from colmap_av1.poses.unregistered import models_of_images, tracks_of_unregistered, within_models
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Floats
 from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.texts import some_names
 from colmap_av1.video.coded_size import smaller_grey
@@ -107,7 +108,7 @@ class JointMatches(ImageMatches):
     """
 
     estimate: JointEstimate
-    poses: list[list[NDArray[np.float64] | None]]
+    poses: list[list[Floats | None]]
 
 
 def match_jointly(
@@ -217,7 +218,7 @@ class _Model:
     placed: PosedImages
     tracks: Tracks
 
-    def poses_of(self, image_set: ImageSet) -> list[NDArray[np.float64] | None]:
+    def poses_of(self, image_set: ImageSet) -> list[Floats | None]:
         """float64 [3, 4] cam_from_world of each image; None if it is not in the model."""
         pose_of = {image.name: image.cam_from_world for image in self.placed.images}
         return [pose_of.get(name) for name in image_set.images.names]
@@ -286,7 +287,7 @@ def _agreeing_tracks(
     return _Agreeing(placed, both, corners.num_tracks, start)
 
 
-def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, NDArray[np.float64]]:
+def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, Floats]:
     """The corners and SIFT links used in the adjustment, without outliers, and their points."""
     known = model.known
     errors = reprojection_errors(known)
@@ -300,9 +301,7 @@ def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, NDArr
     return kept, known.points.xyz[enough]
 
 
-def _agreeing_motion(
-    run: Run, tracks: Tracks, placed: PosedImages
-) -> tuple[Tracks, NDArray[np.float64]]:
+def _agreeing_motion(run: Run, tracks: Tracks, placed: PosedImages) -> tuple[Tracks, Floats]:
     """Motion tracks that have a point, without outliers, and their points."""
     seen, view = seen_in(tracks, placed.frames)
     points = triangulate_in(run, placed, seen, view, options=_POINTS)
@@ -318,7 +317,7 @@ def _agreeing_motion(
     return agreeing, points.xyz
 
 
-def _start(tracks: Tracks, points: NDArray[np.float64], placed: PosedImages) -> StartingPair | None:
+def _start(tracks: Tracks, points: Floats, placed: PosedImages) -> StartingPair | None:
     """The initial pair for a mapper, see `starting_pair`."""
     view = np.searchsorted(placed.frames, tracks.frame)
     start = starting_pair(tracks.track, view, points, placed.images)
@@ -336,9 +335,7 @@ def _num_features(run: Run, image_set: ImageSet) -> float:
     return float(np.mean([len(sift.detect(smaller_grey(own))) for _, own in pictures]))
 
 
-def _matched(
-    agreeing: _Agreeing, frames: NDArray[np.int32], limits: DensityOptions
-) -> NDArray[np.bool_]:
+def _matched(agreeing: _Agreeing, frames: NDArray[np.int32], limits: DensityOptions) -> Bools:
     """Which observations are matched, see `matched_observations`."""
     num_tracks = agreeing.tracks.num_tracks
     is_start = np.zeros(num_tracks, np.bool_)

@@ -23,12 +23,10 @@ from colmap_av1.matching.features.sift import Features, extract_features, masked
 from colmap_av1.matching.links.matching import match_pairs
 from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.options import VerifyOptions
+from colmap_av1.util.arrays import Floats, Picture
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.spread import evenly_spread
-
-_Floats = NDArray[np.float64]
-_Image = NDArray[np.uint8]
 
 # Smallest distance in images of a long-range pair. Neighbours agree even in a bent model.
 _GAP = 10
@@ -73,7 +71,7 @@ class LongRangeErrors:
     """
 
     pairs: tuple[tuple[str, str], ...]
-    error: _Floats
+    error: Floats
     num_in_vain: int
     num_features: int
 
@@ -140,7 +138,7 @@ class LongRangeCheck:
         self,
         images: Sequence[ModelImage],
         cameras: Mapping[int, pycolmap.Camera],
-        points_of: Callable[[int], _Floats],
+        points_of: Callable[[int], Floats],
     ) -> None:
         self._images = images
         self._cameras = [cameras[image.camera_id] for image in images]
@@ -149,7 +147,7 @@ class LongRangeCheck:
         self._features: dict[int, Features] = {}
         self._num_features: list[int] = []  # before masking
 
-    def add(self, index: int, picture: _Image, mask: Mask | None = None) -> None:
+    def add(self, index: int, picture: Picture, mask: Mask | None = None) -> None:
         """Extract features from the picture of an image.
 
         Args:
@@ -190,9 +188,7 @@ class LongRangeCheck:
             num_features=num_features,
         )
 
-    def _errors(
-        self, i: int, j: int, xa: NDArray[np.floating], xb: NDArray[np.floating]
-    ) -> _Floats:
+    def _errors(self, i: int, j: int, xa: NDArray[np.floating], xb: NDArray[np.floating]) -> Floats:
         """Symmetric epipolar distance in pixels of matches [n, 2] by the poses of two images."""
         a, b = self._images[i].cam_from_world, self._images[j].cam_from_world
         normalised = [
@@ -225,7 +221,7 @@ def model_long_range_errors(
     names = list(posed)
     images = [posed[names[k]] for k in natural_order(names)]
 
-    def points_of(index: int) -> _Floats:
+    def points_of(index: int) -> Floats:
         seen = reconstruction.images[images[index].image_id].points2D
         ids = [p.point3D_id for p in seen if p.has_point3D()]
         points = [reconstruction.points3D[point_id].xyz for point_id in ids]
@@ -248,7 +244,7 @@ def model_long_range_errors(
     return check.result()
 
 
-def _near_points(positions: Sequence[_Floats], size: tuple[int, int]) -> Mask | None:
+def _near_points(positions: Sequence[Floats], size: tuple[int, int]) -> Mask | None:
     """The pixels near the positions of points in an image of this (width, height).
 
     None without points. If there are few, the distance is that at which they would cover the image.
@@ -266,8 +262,8 @@ def _near_points(positions: Sequence[_Floats], size: tuple[int, int]) -> Mask | 
 def _far_pairs(
     images: Sequence[ModelImage],
     cameras: Sequence[pycolmap.Camera],
-    points_of: Callable[[int], _Floats],
-) -> tuple[NDArray[np.int32], _Floats]:
+    points_of: Callable[[int], Floats],
+) -> tuple[NDArray[np.int32], Floats]:
     """Choose a few pairs of images that are far apart in time and overlap by their poses.
 
     Returns:
@@ -299,7 +295,7 @@ def _far_pairs(
     )
 
 
-def _viewing_angle(points: _Floats, first: PosedCamera, second: PosedCamera) -> float | None:
+def _viewing_angle(points: Floats, first: PosedCamera, second: PosedCamera) -> float | None:
     """Median angle in degrees between the directions in which two images see the same points.
 
     Returns None if the second image does not see most of the points of the first, or if the angle

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.track_points import seen_in
@@ -23,6 +22,7 @@ from colmap_av1.poses.posed_images import (
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -110,7 +110,7 @@ def _compared(
         return check.result()
 
 
-def _points_by_image(run: Run, tracks: Tracks, placed: PosedImages) -> list[NDArray[np.float64]]:
+def _points_by_image(run: Run, tracks: Tracks, placed: PosedImages) -> list[Floats]:
     """Float64 [n, 3] some points that each image observes."""
     some = tracks.every_nth(max(1, tracks.num_tracks // _NUM_TRACKS))
     seen, view = seen_in(pose_tracks(run, some), placed.frames)

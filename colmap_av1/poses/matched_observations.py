@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from colmap_av1.options import DensityOptions
 from colmap_av1.tracks.selection import spread_observations
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Ints
 
 # The longest and most accurate tracks, up to 150 per image, keep their observations. With more of
 # them, models are not more accurate, and the mapper is slower.
@@ -38,10 +39,10 @@ _LIMITS = {"sparse": (0.14, 500), "default": (0.28, 1000)}
 def matched_observations(
     tracks: Tracks,
     frames: NDArray[np.int32],
-    is_corner: NDArray[np.bool_],
-    is_needed: NDArray[np.bool_],
+    is_corner: Bools,
+    is_needed: Bools,
     limits: DensityOptions,
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Choose the observations that are matched.
 
     A few tracks keep all observations. The other tracks get three matched observations each, the
@@ -85,7 +86,7 @@ def limits_of_density(density: DensityOptions, num_features: Callable[[], float]
     return replace(density, max_tracks_per_image=most, min_images=NUM_OBSERVATIONS)
 
 
-def _is_short_or_revisited(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _is_short_or_revisited(tracks: Tracks, view: Ints) -> Bools:
     """Which tracks are short, or seen again after many images, bool [num_tracks].
 
     Args:
@@ -98,7 +99,7 @@ def _is_short_or_revisited(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[n
     return np.asarray((tracks.lengths <= _SHORT) | (farthest > _REVISITED))
 
 
-def _three_observations(tracks: Tracks, view: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _three_observations(tracks: Tracks, view: Ints) -> Bools:
     """Choose three observations of each track, as far apart as possible, bool [num_observations].
 
     They begin with the first observation of the track or end with its last one, by turns, so that

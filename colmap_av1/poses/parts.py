@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import camera_centres, keep_observations
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
@@ -33,6 +32,7 @@ from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.mapping_stage import MappedResult
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.seams import least_depth_angle, ray_angle
+from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.graphs import connected_components
 from colmap_av1.util.stages import Kept, run_stage
 
@@ -237,7 +237,7 @@ def parts_of(
 
 def _common_points(
     model: PosedModel, stretch_of: Mapping[str, int], num_stretches: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Ints, Ints]:
     """The number of points that every two stretches have in common.
 
     Args:
@@ -258,9 +258,7 @@ def _common_points(
     )
 
 
-def _seen_in_stretches(
-    model: PosedModel, of_image: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+def _seen_in_stretches(model: PosedModel, of_image: Ints) -> tuple[Ints, Ints, Bools]:
     """The points that each stretch sees.
 
     Args:
@@ -286,9 +284,7 @@ def _seen_in_stretches(
     return pair // num_stretches, pair % num_stretches, has_depth
 
 
-def _common(
-    point: NDArray[np.int64], stretch: NDArray[np.int64], shape: tuple[int, int]
-) -> NDArray[np.int64]:
+def _common(point: Ints, stretch: Ints, shape: tuple[int, int]) -> Ints:
     """The number of points that every two stretches have in common.
 
     Args:

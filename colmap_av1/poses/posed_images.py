@@ -19,6 +19,7 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import TriangulateOptions
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.stages import Kept
 
@@ -58,7 +59,7 @@ class PosedImages:
     images: list[ModelImage]
     frames: NDArray[np.int32]
     sequence: NDArray[np.int32]
-    first_frame: NDArray[np.int64]
+    first_frame: Ints
     cameras: dict[int, pycolmap.Camera]
     masks: tuple[Mask | None, ...]
 
@@ -96,11 +97,11 @@ def triangulate_in(
     run: Run,
     placed: PosedImages,
     seen: Tracks,
-    view: NDArray[np.int64],
+    view: Ints,
     *,
     options: TriangulateOptions,
     pinholes: Sequence[pycolmap.Camera] | None = None,
-    rays: NDArray[np.float64] | None = None,
+    rays: Floats | None = None,
     progress: Progress = no_progress,
 ) -> TriangulatedPoints:
     """Triangulate tracks in the registered images, see `triangulate_tracks`."""

@@ -12,11 +12,11 @@ from itertools import pairwise
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.names import natural_key, natural_order, videos_of
+from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.grouping import sums_beside_gaps
 
 # Points with fewer views are ignored: two views do not constrain the scale between images.
@@ -74,10 +74,10 @@ class Seams:
     """
 
     pairs: tuple[tuple[str, str], ...]
-    num_points: NDArray[np.int64]
-    num_elsewhere: NDArray[np.int64]
-    num_scaled: NDArray[np.int64]
-    num_deep: NDArray[np.int64]
+    num_points: Ints
+    num_elsewhere: Ints
+    num_scaled: Ints
+    num_deep: Ints
 
     @property
     def disconnected(self) -> list[int]:
@@ -216,7 +216,7 @@ def model_seams(
     np.minimum.at(deep_from, visit[from_first], views[from_first])
     np.maximum.at(deep_to, visit[from_last], views[from_last])
 
-    def between(start: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.int64]:
+    def between(start: Ints, end: Ints) -> Ints:
         """Number of points at each seam. A point spans the seams from `start` to before `end`."""
         some = start < end
         change = np.bincount(start[some], minlength=num_images + 1)
@@ -241,9 +241,7 @@ def model_seams(
     )
 
 
-def _are_held_by_others(
-    sequence: NDArray[np.int64], views: NDArray[np.int64], point: NDArray[np.int64]
-) -> NDArray[np.bool_]:
+def _are_held_by_others(sequence: Ints, views: Ints, point: Ints) -> Bools:
     """Whether most points near each seam are seen by images of other sequences, too.
 
     Args:
@@ -278,12 +276,12 @@ def images_in_time(images: Sequence[ModelImage]) -> tuple[list[ModelImage], list
 
 
 def _points_of_loose_stretches(
-    crossing: NDArray[np.int64],
-    soon: NDArray[np.int64],
-    is_seam: NDArray[np.bool_],
-    views: NDArray[np.int64],
-    point: NDArray[np.int64],
-) -> NDArray[np.int64]:
+    crossing: Ints,
+    soon: Ints,
+    is_seam: Bools,
+    views: Ints,
+    point: Ints,
+) -> Ints:
     """The number of points at each seam; at a weak one, at most those of the stretch beside it.
 
     Where images between two parts of a video are not registered, views on either side of them count
@@ -316,21 +314,19 @@ def _points_of_loose_stretches(
     return np.where(is_seam & ends, np.minimum(crossing, beside), crossing)
 
 
-def _share_of_median(num_points: NDArray[np.int64], share: float, most: float) -> float:
+def _share_of_median(num_points: Ints, share: float, most: float) -> float:
     """A share of the median number of points of all seams, or `most` if that is less."""
     return min(share * float(np.median(num_points)), most)
 
 
-def _places_in_time(names: Sequence[str], all_images: Collection[str]) -> NDArray[np.int64]:
+def _places_in_time(names: Sequence[str], all_images: Collection[str]) -> Ints:
     """Place of each image of a model, int64 [n], in the natural order of these and all images."""
     everything = sorted({*names, *all_images}, key=natural_key)
     place = {name: k for k, name in enumerate(everything)}
     return np.array([place[name] for name in names], np.int64)
 
 
-def _seen_points(
-    model: PosedModel, images: Sequence[ModelImage]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+def _seen_points(model: PosedModel, images: Sequence[ModelImage]) -> tuple[Ints, Ints, Floats]:
     """The views of points with at least three of them, sorted by point and image.
 
     Args:
@@ -362,9 +358,7 @@ def least_depth_angle(cameras: Iterable[pycolmap.Camera]) -> float:
     return float(np.degrees(_LEAST_PARALLAX / np.median(focal))) if focal else 0.0
 
 
-def ray_angle(
-    a: NDArray[np.float64], b: NDArray[np.float64], point: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def ray_angle(a: Floats, b: Floats, point: Floats) -> Floats:
     """Angle in degrees between the rays from two positions [n, 3] to each point [n, 3]."""
     rays = [(point - c) / np.linalg.norm(point - c, axis=1, keepdims=True) for c in (a, b)]
     half = np.linalg.norm(rays[0] - rays[1], axis=1) / 2

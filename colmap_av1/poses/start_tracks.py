@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.file import write_existing
 from colmap_av1.database.reading import image_ids_from_pair_id, matches_from_row
+from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.graphs import connected_components
 
 # Number of tracks that each image and each pair keeps.
@@ -58,10 +59,10 @@ def keep_start_tracks(database: Path) -> None:
 
 
 def _on_start_tracks(
-    num_keypoints: NDArray[np.int64],
-    pairs: NDArray[np.int64],
+    num_keypoints: Ints,
+    pairs: Ints,
     matches: list[NDArray[np.uint32]],
-) -> list[NDArray[np.bool_]]:
+) -> list[Bools]:
     """Select the matches on the tracks that are kept.
 
     Args:
@@ -94,7 +95,7 @@ def _on_start_tracks(
     return np.split(is_kept[track], np.cumsum(counts)[:-1])
 
 
-def _members(track: NDArray[np.int64], member: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _members(track: Ints, member: Ints) -> list[Ints]:
     """The members of each track, without repetitions."""
     num_members = int(member.max()) + 1
     track, member = np.divmod(np.unique(track * num_members + member), num_members)

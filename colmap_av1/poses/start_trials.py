@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matches
 from colmap_av1.geometry.cameras import with_known_focal_lengths
@@ -23,6 +22,7 @@ from colmap_av1.matching.initial_pairs import PreparedStart, are_far, with_demot
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
+from colmap_av1.util.arrays import Bools
 from colmap_av1.util.progress import Clock
 
 # A start has succeeded with this number of images, or with half of all images. It is the least
@@ -116,7 +116,7 @@ def _without_failing_starts(
     return matched
 
 
-def _demoted(matched: MatchedImages, which: NDArray[np.bool_]) -> MatchedImages | None:
+def _demoted(matched: MatchedImages, which: Bools) -> MatchedImages | None:
     """The images with demoted pairs, bool [num_pairs]; None if they were demoted before."""
     changed = with_demoted(matched, np.flatnonzero(which))
     both = zip(changed.geometries, matched.geometries, strict=True)

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.matching.mapper_limits import (
@@ -22,10 +21,9 @@ from colmap_av1.matching.mapper_limits import (
     INITIAL_MIN_ANGLE,
     INITIAL_MIN_INLIERS,
 )
+from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.spread import evenly_spread
-
-_Floats = NDArray[np.float64]
 
 _ENOUGH = round(1.5 * INITIAL_MIN_INLIERS)
 _FORWARD = INITIAL_MAX_FORWARD_MOTION - INITIAL_FORWARD_TOLERANCE
@@ -46,7 +44,7 @@ class StartingPair:
 
     first: int
     second: int
-    points: NDArray[np.int64]
+    points: Ints
 
 
 @dataclass(frozen=True)
@@ -54,11 +52,11 @@ class _Candidate:
     """A pair of images, the points that both observe, and their triangulation angles in degrees."""
 
     pair: tuple[int, int]
-    points: NDArray[np.int64]
-    angles: _Floats
+    points: Ints
+    angles: Floats
     is_forward: bool
 
-    def wide(self, angle: float) -> NDArray[np.int64]:
+    def wide(self, angle: float) -> Ints:
         """The points to match the pair by, so that their median angle is large enough."""
         if np.median(self.angles) >= angle:
             return self.points
@@ -66,9 +64,9 @@ class _Candidate:
 
 
 def starting_pair(
-    point: NDArray[np.int64],
-    view: NDArray[np.int64],
-    xyz: _Floats,
+    point: Ints,
+    view: Ints,
+    xyz: Floats,
     images: list[ModelImage],
 ) -> StartingPair | None:
     """Find the pair with the most points at a large angle, with sideways motion if possible.
@@ -95,7 +93,7 @@ def starting_pair(
 
 
 def _candidates(
-    point: NDArray[np.int64], view: NDArray[np.int64], xyz: _Floats, images: list[ModelImage]
+    point: Ints, view: Ints, xyz: Floats, images: list[ModelImage]
 ) -> Iterator[_Candidate]:
     poses = np.array([image.cam_from_world for image in images])
     centres = camera_centres(poses)

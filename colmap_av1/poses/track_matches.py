@@ -14,6 +14,7 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Ints
 
 Pairs = NDArray[np.int32]
 
@@ -26,7 +27,7 @@ def tracks_of_model(model: PosedModel, image_set: ImageSet) -> Tracks:
     return tracks_of_points(model.points, frames, image_set.num_frames, size)
 
 
-def at_same_place(tracks: Tracks, others: Tracks, distance: float) -> NDArray[np.bool_]:
+def at_same_place(tracks: Tracks, others: Tracks, distance: float) -> Bools:
     """Which tracks have an observation at the position of an observation of another track.
 
     Args:
@@ -43,8 +44,8 @@ def at_same_place(tracks: Tracks, others: Tracks, distance: float) -> NDArray[np
     columns = int(max(tracks.width, others.width) / distance) + 3
     rows = int(max(tracks.height, others.height) / distance) + 3
 
-    def cells(own: Tracks) -> NDArray[np.int64]:
-        at: NDArray[np.int64] = (own.xy / distance).astype(np.int64) + 1
+    def cells(own: Tracks) -> Ints:
+        at: Ints = (own.xy / distance).astype(np.int64) + 1
         return np.asarray((own.frame.astype(np.int64) * rows + at[:, 1]) * columns + at[:, 0])
 
     around = np.array([dy * columns + dx for dy in (-1, 0, 1) for dx in (-1, 0, 1)])

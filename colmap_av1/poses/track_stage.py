@@ -30,6 +30,7 @@ from colmap_av1.options import EncodeOptions, RefineOptions, TrackingOptions
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import TrackedVideo, count_frames
+from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Clock
 from colmap_av1.util.spread import evenly_spread
@@ -66,7 +67,7 @@ class VideoTracks:
     tracks: Tracks
     chosen: ChosenImages
     inter_share: NDArray[np.float32]
-    fast: NDArray[np.bool_]
+    fast: Bools
     read_out: float | None
     digest: str = ""
 
@@ -241,8 +242,8 @@ def key_images_of_video(
     tracks: Tracks,
     chosen: ChosenImages,
     inter_share: NDArray[np.float32],
-    fast: NDArray[np.bool_],
-) -> NDArray[np.int64]:
+    fast: Bools,
+) -> Ints:
     """Indices of the key images among some images of a video.
 
     Args:

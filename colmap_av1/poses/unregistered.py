@@ -14,6 +14,7 @@ from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Ints
 
 # Up to this many consecutive images that are not registered belong to the model around them.
 _LONGEST_GAP = 3
@@ -41,7 +42,7 @@ def tracks_of_unregistered(
 
 
 def within_models(
-    tracks: Tracks, left: Sequence[str], model_of: NDArray[np.int64], image_set: ImageSet
+    tracks: Tracks, left: Sequence[str], model_of: Ints, image_set: ImageSet
 ) -> Tracks:
     """Split tracks so that none connects two models or leads to images that belong to none.
 
@@ -66,7 +67,7 @@ def within_models(
 
 def models_of_images(
     tracks: Tracks, registered: Sequence[NDArray[np.int32]], image_set: ImageSet
-) -> NDArray[np.int64]:
+) -> Ints:
     """The model that each image belongs to, whether it is registered or not.
 
     Where the estimate does not register images, motion is unreliable. If it were matched there, a

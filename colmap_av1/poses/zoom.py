@@ -13,7 +13,6 @@ from collections.abc import Collection, Container
 from dataclasses import replace
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.poses.adjusting import (
@@ -24,6 +23,7 @@ from colmap_av1.poses.adjusting import (
     refines_intrinsics,
 )
 from colmap_av1.poses.run import Run
+from colmap_av1.util.arrays import Bools
 
 # Number of images that share a trial camera; fewer determine its focal length less well.
 _GROUP = 5
@@ -99,7 +99,7 @@ def _zooming_cameras(run: Run, model: PosedModel) -> set[int]:
     return zooming
 
 
-def _mean_cost(model: PosedModel, is_own: NDArray[np.bool_]) -> float:
+def _mean_cost(model: PosedModel, is_own: Bools) -> float:
     """Mean cost of the observations in some images.
 
     Points behind the camera do not count: COLMAP drops them during the adjustment.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.geometry.colmap_model import ModelPoints, joined_points, take_points
@@ -16,10 +15,8 @@ from colmap_av1.geometry.coverage import (
     squares_of_cells,
     without_gaps,
 )
+from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.spread import evenly_spread
-
-_Floats = NDArray[np.float64]
-_Ints = NDArray[np.int64]
 
 # Points are thinned in evenly spread images: at least 32, at most 128, in between every 6th image.
 # Holes are filled in at most _FILLED_IMAGES images, which are evenly spread, too.
@@ -88,7 +85,7 @@ def splat_cloud(
     return joined_points([kept, filled])
 
 
-def _stages(points: ModelPoints, images: Sequence[PosedCamera]) -> _Ints:
+def _stages(points: ModelPoints, images: Sequence[PosedCamera]) -> Ints:
     """Index of the widest spacing at which each point is kept in one of the images, int64 [n].
 
     Points that are not kept at any spacing get the number of spacings.
@@ -154,13 +151,13 @@ def _spread_order(count: int) -> list[int]:
     return [i for i in order if i < count]
 
 
-def _usual_depth(surfaces: list[_Floats]) -> float:
+def _usual_depth(surfaces: list[Floats]) -> float:
     """Depth assumed in an image without points."""
     known = np.concatenate([grid[np.isfinite(grid)] for grid in surfaces])
     return float(np.quantile(known, _FARTHER)) if len(known) else 1.0
 
 
-def _depth_of_holes(grid: _Floats, usual: float) -> _Floats:
+def _depth_of_holes(grid: Floats, usual: float) -> Floats:
     """Fill the grid's holes with depths interpolated from the cells at their edges.
 
     If one side of a hole is near and another far, the hole is assumed to show the background, for
@@ -189,9 +186,7 @@ def _depth_of_holes(grid: _Floats, usual: float) -> _Floats:
     return np.asarray(depth)
 
 
-def _squares(
-    view: PosedCamera, rows: _Ints, columns: _Ints
-) -> tuple[_Floats, _Ints, NDArray[np.bool_]]:
+def _squares(view: PosedCamera, rows: Ints, columns: Ints) -> tuple[Floats, Ints, Bools]:
     """Squares in cells: centres in pixels, cells, and whether each is the first of its cell."""
     per_cell = CELL // _FILLING
     xy = squares_of_cells(rows, columns, per_cell)
@@ -207,11 +202,11 @@ def _squares(
 
 def _behind(
     view: PosedCamera,
-    xy: _Floats,
-    depth: _Floats,
+    xy: Floats,
+    depth: Floats,
     farthest: float,
-    others: Sequence[tuple[PosedCamera, _Floats]],
-) -> _Floats:
+    others: Sequence[tuple[PosedCamera, Floats]],
+) -> Floats:
     """Points at pixels and depths of an image, moved back if they would hide others' surfaces."""
     rays = view.rays(xy) @ view.cam_from_world[:, :3]
     xyz = view.centre + rays * np.maximum(depth, farthest)[:, None]
@@ -232,7 +227,7 @@ def _behind(
 
 
 def _with_observations(
-    xyz: _Floats, images: Sequence[PosedCamera], seen_by: Sequence[int], own: int
+    xyz: Floats, images: Sequence[PosedCamera], seen_by: Sequence[int], own: int
 ) -> ModelPoints:
     """Points with observations in the images that they project into.
 

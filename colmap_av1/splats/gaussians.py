@@ -21,10 +21,9 @@ from colmap_av1.geometry.colmap_model import (
 )
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.distant_points import distance_uncertainty
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.files import check_creatable, check_new_file, whole_file
 from colmap_av1.util.spread import evenly_spread
-
-_Floats = NDArray[np.float64]
 
 # Number of evenly spread images in which the spacing of points is measured.
 _IMAGES = 32
@@ -68,11 +67,11 @@ class Gaussians:
         rgb: uint8 [n, 3] colours.
     """
 
-    xyz: _Floats
-    normal: _Floats
-    scale: _Floats
-    rotation: _Floats
-    opacity: _Floats
+    xyz: Floats
+    normal: Floats
+    scale: Floats
+    rotation: Floats
+    opacity: Floats
     rgb: NDArray[np.uint8]
 
 
@@ -100,7 +99,7 @@ def initial_gaussians(points: ModelPoints, images: Sequence[PosedCamera]) -> Gau
     )
 
 
-def _spacing(xyz: _Floats, images: Sequence[PosedCamera]) -> _Floats:
+def _spacing(xyz: Floats, images: Sequence[PosedCamera]) -> Floats:
     """Distance of each point to its neighbours on the same surface, measured in the images."""
     from scipy.spatial import KDTree  # noqa: PLC0415 - slow to import
 
@@ -121,7 +120,7 @@ def _spacing(xyz: _Floats, images: Sequence[PosedCamera]) -> _Floats:
     return np.asarray(np.exp(total))
 
 
-def _on_surfaces(xyz: _Floats) -> tuple[_Floats, _Floats]:
+def _on_surfaces(xyz: Floats) -> tuple[Floats, Floats]:
     """Quaternions [n, 4] of local axes, and normals [n, 3], which are the third axes."""
     from scipy.spatial import KDTree  # noqa: PLC0415 - slow to import
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
@@ -142,7 +141,7 @@ def _on_surfaces(xyz: _Floats) -> tuple[_Floats, _Floats]:
     return rotation, normal
 
 
-def _depth_error(points: ModelPoints, images: Sequence[PosedCamera]) -> _Floats:
+def _depth_error(points: ModelPoints, images: Sequence[PosedCamera]) -> Floats:
     """Expected error of each point's distance; inf if its observations do not determine one."""
     lengths = np.diff(points.offsets)
     error = np.full(len(lengths), np.inf)

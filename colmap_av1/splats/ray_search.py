@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.geometry.coverage import PosedCamera
-
-_Floats = NDArray[np.float64]
-_Ints = NDArray[np.int64]
+from colmap_av1.util.arrays import Bools, Floats, Ints
 
 # Pictures are reduced by an integer factor to at most this number of pixels.
 _MOST_PIXELS = 250_000
@@ -52,16 +50,16 @@ class Swept:
     """
 
     image: int
-    xy: _Floats
-    depth: _Floats
+    xy: Floats
+    depth: Floats
     others: list[int]
-    seen: _Floats
+    seen: Floats
 
-    def take(self, kept: NDArray[np.bool_]) -> Swept:
+    def take(self, kept: Bools) -> Swept:
         """Select points."""
         return Swept(self.image, self.xy[kept], self.depth[kept], self.others, self.seen[:, kept])
 
-    def xyz(self, view: PosedCamera) -> _Floats:
+    def xyz(self, view: PosedCamera) -> Floats:
         """The points in the world."""
         own = view.rays(self.xy) * self.depth[:, None] - view.cam_from_world[:, 3]
         return np.asarray(own @ view.cam_from_world[:, :3])
@@ -74,7 +72,7 @@ class Grey:
     pixels: NDArray[np.uint8]
     factor: int
 
-    def place(self, xy: _Floats) -> NDArray[np.float32]:
+    def place(self, xy: Floats) -> NDArray[np.float32]:
         """Convert pixels of the picture to pixels of the reduced picture."""
         return (xy / self.factor).astype(np.float32)
 
@@ -100,7 +98,7 @@ def sweep_image(
     views: Sequence[PosedCamera],
     key: int,
     greys: Mapping[int, Grey],
-    xy: _Floats,
+    xy: Floats,
     least_depth: float,
     *,
     threads: Executor,
@@ -156,14 +154,14 @@ def sweep_image(
     )
 
 
-def _correlate(one: Grey, xy: _Floats, two: Grey, at: _Floats) -> NDArray[np.float32]:
+def _correlate(one: Grey, xy: Floats, two: Grey, at: Floats) -> NDArray[np.float32]:
     """Correlations [n, d] of patches at [n, 2] of one image and at [n, d, 2] of another."""
     return _core.correlate_patches(
         one.pixels, one.place(xy), two.pixels, two.place(at), min_deviation=_LEAST_DEVIATION
     )
 
 
-def _seen_at(view: PosedCamera, other: PosedCamera, rays: _Floats, inverse: _Floats) -> _Floats:
+def _seen_at(view: PosedCamera, other: PosedCamera, rays: Floats, inverse: Floats) -> Floats:
     """Project points on rays [n, 3] at inverse depths [n or 1, d] to pixels [n, d, 2].
 
     The pixels are in the image `other`, and NaN behind its camera or outside its field of view.
@@ -188,7 +186,7 @@ def _mean_of_best(found: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray((best + second) / 2)
 
 
-def _is_clear(found: NDArray[np.float32], best: _Ints) -> NDArray[np.bool_]:
+def _is_clear(found: NDArray[np.float32], best: Ints) -> Bools:
     """Whether the best step of each row is good, and clearly better than all distant steps.
 
     The first step (infinity) and the last are rejected, because the true depth may lie beyond them.
@@ -201,7 +199,7 @@ def _is_clear(found: NDArray[np.float32], best: _Ints) -> NDArray[np.bool_]:
     return np.asarray(is_clear)
 
 
-def _top(found: NDArray[np.float32], best: _Ints) -> _Floats:
+def _top(found: NDArray[np.float32], best: Ints) -> Floats:
     """Steps with subpixel refinement: maximum of a parabola through the best and adjacent steps."""
     beside = np.clip(best[:, None] + np.arange(-1, 2), 0, found.shape[1] - 1)
     left, middle, right = np.take_along_axis(found, beside, axis=1).astype(np.float64).T
@@ -212,7 +210,7 @@ def _top(found: NDArray[np.float32], best: _Ints) -> _Floats:
     )
 
 
-def _own_best(found: NDArray[np.float32], best: _Ints) -> tuple[_Floats, NDArray[np.bool_]]:
+def _own_best(found: NDArray[np.float32], best: Ints) -> tuple[Floats, Bools]:
     """One picture's best step near the common best step, and whether it observes the point.
 
     Args:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.cameras import is_undistorted
 from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, take_points, write_model
@@ -45,10 +44,9 @@ from colmap_av1.poses.run import Run
 from colmap_av1.splats.gaussians import remove_gaussians_in
 from colmap_av1.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Picture
 from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import check_unchanged
-
-_Image = NDArray[np.uint8]
 
 # Folder of the masks, if there are any.
 _MASKS = "masks"
@@ -106,7 +104,7 @@ def _undistortions(placed: PosedImages, cameras: Mapping[int, pycolmap.Camera]) 
     return of_image
 
 
-def _undistorted(picture: _Image, how: Undistortion | None) -> _Image:
+def _undistorted(picture: Picture, how: Undistortion | None) -> Picture:
     return how(picture) if how is not None else picture
 
 
@@ -122,10 +120,10 @@ def _written_images(
     index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
     names = [image.name for image in placed.images]
 
-    def change(first: int, frame: int, picture: _Image) -> _Image:
+    def change(first: int, frame: int, picture: Picture) -> Picture:
         return _undistorted(picture, undistort(index_of_frame[first + frame]))
 
-    def look_at(first: int, frame: int, picture: _Image) -> None:
+    def look_at(first: int, frame: int, picture: Picture) -> None:
         look(index_of_frame[first + frame], picture)
 
     done = 0

@@ -30,11 +30,9 @@ from colmap_av1.splats.ray_search import (
     smaller,
     sweep_image,
 )
+from colmap_av1.util.arrays import Bools, Floats
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.spread import evenly_spread
-
-_Floats = NDArray[np.float64]
-_Ints = NDArray[np.int64]
 
 # Every second image is swept, but at most _MOST_IMAGES, evenly spread.
 _EVERY = 2
@@ -142,7 +140,7 @@ class Sweep:
         self._found.append(take_points(own, np.flatnonzero(exact)))
 
 
-def _nearest_observed(points: ModelPoints, views: Sequence[PosedCamera]) -> list[_Floats]:
+def _nearest_observed(points: ModelPoints, views: Sequence[PosedCamera]) -> list[Floats]:
     """Depth of the nearest observed point in each cell of each image; inf without one."""
     owner = points.point
     by_image, bounds = grouped(points.image, len(views))
@@ -155,7 +153,7 @@ def _nearest_observed(points: ModelPoints, views: Sequence[PosedCamera]) -> list
     return grids
 
 
-def _near_depth(view: PosedCamera, xyz: _Floats) -> float:
+def _near_depth(view: PosedCamera, xyz: Floats) -> float:
     """Depth of the nearest points in front of a camera, in its picture or not; inf without any."""
     depth = xyz @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
     depth = depth[depth > 0]
@@ -182,7 +180,7 @@ def _others(
     return [key + number * step for number in _OTHERS if there(number * step)]
 
 
-def _away_from_masks(view: PosedCamera) -> NDArray[np.bool_]:
+def _away_from_masks(view: PosedCamera) -> Bools:
     """The cells of an image without masked pixels in them or in adjacent cells.
 
     Masked objects are mostly dynamic and move little between pictures. At their edges, pictures
@@ -196,7 +194,7 @@ def _away_from_masks(view: PosedCamera) -> NDArray[np.bool_]:
     return np.asarray(~binary_dilation(left_out, np.ones((3, 3))))
 
 
-def _squares(view: PosedCamera, cells: NDArray[np.bool_], factor: int) -> _Floats:
+def _squares(view: PosedCamera, cells: Bools, factor: int) -> Floats:
     """Centres in pixels of the squares to sweep, four or one in each cell."""
     rows, columns = np.nonzero(cells)
     per_cell = 2 if factor <= CELL // _LEAST_SQUARE // 2 else 1
@@ -205,7 +203,7 @@ def _squares(view: PosedCamera, cells: NDArray[np.bool_], factor: int) -> _Float
     return xy[view.keeps(xy)]
 
 
-def _is_supported(xy: _Floats, depth: _Floats) -> NDArray[np.bool_]:
+def _is_supported(xy: Floats, depth: Floats) -> Bools:
     """Whether each point has a nearby point of similar depth."""
     from scipy.spatial import KDTree  # noqa: PLC0415 - slow to import
 
@@ -221,8 +219,8 @@ def _hides(
     swept: Swept,
     views: Sequence[PosedCamera],
     sequence: NDArray[np.int32],
-    observed: Sequence[_Floats],
-) -> NDArray[np.bool_]:
+    observed: Sequence[Floats],
+) -> Bools:
     """Whether points would hide points of tracks in the images before and after."""
     xyz = swept.xyz(views[swept.image])
     hides, seen = np.zeros(len(xyz)), np.zeros(len(xyz))

@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.video.coded_size import smaller_grey
 
 _Floats = NDArray[np.float32]
 # Returns which positions [n, 2] are valid, given the index of a frame and the (width, height) of
 # its picture.
-IsValid = Callable[[int, _Floats, tuple[int, int]], NDArray[np.bool_]]
+IsValid = Callable[[int, _Floats, tuple[int, int]], Bools]
 
 # Smallest strength of a corner, relative to the strongest one of the picture.
 _QUALITY = 0.01
@@ -81,10 +82,10 @@ def follow_corners(
     by_frame, bounds = guide.by_frame()
     track = guide.track
 
-    def observations(frame: int) -> NDArray[np.int64]:
+    def observations(frame: int) -> Ints:
         return by_frame[bounds[frame] : bounds[frame + 1]]
 
-    seen: list[tuple[int, NDArray[np.int64], _Floats]] = []
+    seen: list[tuple[int, Ints, _Floats]] = []
     before: tuple[int, NDArray[np.uint8]] | None = None
     number, at = np.empty(0, np.int64), np.empty((0, 2), np.float32)
     count, scale = 0, np.ones(2, np.float32)
@@ -113,10 +114,10 @@ def follow_corners(
 
 
 def _motion(
-    before: NDArray[np.int64],
-    now: NDArray[np.int64],
+    before: Ints,
+    now: Ints,
     xy: _Floats,
-    track: NDArray[np.int64],
+    track: Ints,
 ) -> tuple[_Floats, _Floats]:
     """Position in the first frame, and motion to the second, of the tracks observed in both.
 
@@ -144,7 +145,7 @@ def _nearest(start: _Floats, motion: _Floats, at: _Floats) -> _Floats:
 
 def _follow(
     before: NDArray[np.uint8], now: NDArray[np.uint8], at: _Floats, motion: _Floats
-) -> tuple[_Floats, NDArray[np.bool_]]:
+) -> tuple[_Floats, Bools]:
     """Search for corners near the positions to which their expected motion leads.
 
     Returns:
@@ -154,7 +155,7 @@ def _follow(
 
     def search(
         source: NDArray[np.uint8], target: NDArray[np.uint8], p: _Floats, to: _Floats, levels: int
-    ) -> tuple[_Floats, NDArray[np.bool_]]:
+    ) -> tuple[_Floats, Bools]:
         # OpenCV's origin is the centre of the first pixel.
         found, ok, _ = cv2.calcOpticalFlowPyrLK(
             source,
@@ -175,9 +176,7 @@ def _follow(
     return found, forward & backward & (error <= _MAX_RETURN)
 
 
-def _are_usable(
-    is_valid: IsValid, frame: int, size: tuple[int, int], at: _Floats
-) -> NDArray[np.bool_]:
+def _are_usable(is_valid: IsValid, frame: int, size: tuple[int, int], at: _Floats) -> Bools:
     """Whether positions lie inside the picture of a frame and are valid."""
     inside = np.asarray(((at >= 0) & (at <= size)).all(axis=1))
     inside[inside] = is_valid(frame, at[inside], size)
@@ -196,9 +195,7 @@ def _new_corners(grey: NDArray[np.uint8], at: _Floats, density: CornerDensity) -
     return np.asarray(found.reshape(-1, 2) + np.float32(0.5), np.float32)
 
 
-def _as_tracks(
-    guide: Tracks, seen: list[tuple[int, NDArray[np.int64], _Floats]], scale: _Floats
-) -> Tracks:
+def _as_tracks(guide: Tracks, seen: list[tuple[int, Ints, _Floats]], scale: _Floats) -> Tracks:
     """The corners that are observed in enough images, as tracks."""
     number = np.concatenate([[], *(n for _, n, _ in seen)]).astype(np.int64)
     xy = np.concatenate([np.empty((0, 2), np.float32), *(at for _, _, at in seen)]) * scale

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.grouping import grouped
 
 # Largest motion of an overlay in pixels: the finest step of a motion vector.
@@ -47,7 +48,7 @@ def remove_overlays(tracks: Tracks, moving: Tracks | None = None) -> Tracks:
     return tracks.keep_tracks(~is_overlay)
 
 
-def _picture_motion(tracks: Tracks) -> NDArray[np.float64]:
+def _picture_motion(tracks: Tracks) -> Floats:
     """Median motion of tracks into each frame in pixels: float64 [num_frames], 0 without tracks."""
     starts = np.zeros(tracks.num_observations, dtype=np.bool_)
     starts[tracks.offsets[:-1]] = True

@@ -16,6 +16,7 @@ from colmap_av1.options import DensityOptions, RefineOptions
 from colmap_av1.tracks.selection import spread_observations
 from colmap_av1.tracks.texture import texture_at
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Floats, Ints
 
 # Pixels around the window of a template: one for its gradients, two for the backward search.
 _MARGIN = 3
@@ -48,7 +49,7 @@ def refine_tracks(
     options: RefineOptions = RefineOptions(),
     progress: Callable[[int], None] | None = None,
     *,
-    expected: NDArray[np.bool_] | None = None,
+    expected: Bools | None = None,
 ) -> Tracks:
     """Correct track positions by Lucas-Kanade on the decoded pictures.
 
@@ -148,24 +149,22 @@ class RefinedTracks:
 
     tracks: Tracks
     options: RefineOptions
-    track: NDArray[np.int64]  # of each observation
-    is_first: NDArray[np.bool_]
-    is_last: NDArray[np.bool_]
-    is_located: NDArray[np.bool_]  # observed or found, so that the picture there shows the track
+    track: Ints  # of each observation
+    is_first: Bools
+    is_last: Bools
+    is_located: Bools  # observed or found, so that the picture there shows the track
     step: NDArray[np.float32]  # the bitstream's motion from the previous observation
-    step_variance: NDArray[np.float64]
-    bitstream_variance: NDArray[np.float64]
+    step_variance: Floats
+    bitstream_variance: Floats
     xy: NDArray[np.float32]
-    variance: NDArray[np.float64]
-    confirmed: NDArray[np.bool_]
+    variance: Floats
+    confirmed: Bools
     templates: _Templates
     last_image: NDArray[np.uint8] | None = None
     last_frame: int = -1
 
     @classmethod
-    def start(
-        cls, tracks: Tracks, options: RefineOptions, expected: NDArray[np.bool_] | None
-    ) -> RefinedTracks:
+    def start(cls, tracks: Tracks, options: RefineOptions, expected: Bools | None) -> RefinedTracks:
         """The state before the first frame."""
         num_observations = tracks.num_observations
         is_first = np.zeros(num_observations, dtype=np.bool_)
@@ -220,13 +219,13 @@ class RefinedTracks:
         for missing in range(next_frame, tracks.num_frames):
             self.skip(by_frame[bounds[missing] : bounds[missing + 1]])
 
-    def skip(self, seen: NDArray[np.int64]) -> None:
+    def skip(self, seen: Ints) -> None:
         """Move the observations in a frame without a picture by the bitstream's steps."""
         later = seen[~self.is_first[seen]]
         self._follow(later)
         self.templates.drop(self.track[seen[self.is_last[seen]]])
 
-    def refine(self, seen: NDArray[np.int64], image: NDArray[np.uint8]) -> None:
+    def refine(self, seen: Ints, image: NDArray[np.uint8]) -> None:
         """Correct the observations in the frame whose picture is `image`."""
         frame = int(self.tracks.frame[seen[0]]) if len(seen) else -1
         later = seen[~self.is_first[seen]]
@@ -278,7 +277,7 @@ class RefinedTracks:
         templates.source[self.track[renewed]] = renewed
         self.last_image, self.last_frame = image, frame
 
-    def _follow(self, later: NDArray[np.int64]) -> None:
+    def _follow(self, later: Ints) -> None:
         """Predict observations from the previous ones by the bitstream's steps."""
         limits = np.array([self.tracks.width, self.tracks.height], np.float32)
         self.xy[later] = np.clip(self.xy[later - 1] + self.step[later], 0, limits)
@@ -286,10 +285,10 @@ class RefinedTracks:
 
     def accept(
         self,
-        observations: NDArray[np.int64],
+        observations: Ints,
         found: _Matches,
-        source: NDArray[np.int64],
-    ) -> NDArray[np.bool_]:
+        source: Ints,
+    ) -> Bools:
         """Use the matches that are good enough, and return which ones are.
 
         Args:
@@ -322,11 +321,11 @@ class _Templates:
     tile: int  # width of a tile in pixels
     columns: int
     atlas: NDArray[np.uint8]
-    free: NDArray[np.int64]  # free slots, a stack
+    free: Ints  # free slots, a stack
     num_free: int
-    slot: NDArray[np.int64]  # of each track; -1: none
+    slot: Ints  # of each track; -1: none
     point: NDArray[np.float32]  # of each track in the atlas; the first pixel's centre is (0, 0)
-    source: NDArray[np.int64]  # the observation of each track that its template shows
+    source: Ints  # the observation of each track that its template shows
     contrast: NDArray[np.float32]  # mean absolute deviation in grey levels
     softness: NDArray[np.float32]  # matching error in pixels for noise of one grey level
     misses: NDArray[np.int32]  # frames without a confirmation
@@ -358,7 +357,7 @@ class _Templates:
         framed = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
         return np.asarray(framed, dtype=np.uint8)
 
-    def drop(self, track: NDArray[np.int64]) -> None:
+    def drop(self, track: Ints) -> None:
         """Release the tracks' templates."""
         track = track[self.slot[track] >= 0]
         self.free[self.num_free : self.num_free + len(track)] = self.slot[track]
@@ -368,7 +367,7 @@ class _Templates:
     def take(
         self,
         image: NDArray[np.uint8],
-        track: NDArray[np.int64],
+        track: Ints,
         xy: NDArray[np.float32],
     ) -> None:
         """Store the picture around positions as templates of tracks, if there is texture."""
@@ -399,7 +398,7 @@ class _Templates:
 
 @dataclass(frozen=True)
 class _Matches:
-    ok: NDArray[np.bool_]
+    ok: Bools
     position: NDArray[np.float32]  # [n, 2], origin at the picture's corner
     difference: NDArray[np.float32]  # [n] mean absolute difference in grey levels
 
@@ -444,7 +443,7 @@ def _match(
     return _Matches(ok, found, np.where(ok, difference.ravel(), np.inf))
 
 
-def _match_variance(noise: NDArray[np.float32], prior: NDArray[np.float64]) -> NDArray[np.float64]:
+def _match_variance(noise: NDArray[np.float32], prior: Floats) -> Floats:
     """Expected variance in px^2 of matches.
 
     Args:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from colmap_av1 import _core
 from colmap_av1.options import DensityOptions
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools
 from colmap_av1.util.grouping import grouped
 
 
@@ -88,7 +89,7 @@ def select_tracks(tracks: Tracks, options: DensityOptions = DensityOptions()) ->
     return tracks.keep_observations(_spread(tracks, variance, limits))
 
 
-def spread_observations(tracks: Tracks, options: DensityOptions) -> NDArray[np.bool_]:
+def spread_observations(tracks: Tracks, options: DensityOptions) -> Bools:
     """Which observations `select_tracks` would keep without limits on errors: bool [n]."""
     return _spread(tracks, _variance_since_first(tracks), _limits_of(options))
 
@@ -100,7 +101,7 @@ def _limits_of(options: DensityOptions) -> _Limits:
     return replace(PRESETS[options.preset], **given)
 
 
-def _spread(tracks: Tracks, variance: NDArray[np.float32], limits: _Limits) -> NDArray[np.bool_]:
+def _spread(tracks: Tracks, variance: NDArray[np.float32], limits: _Limits) -> Bools:
     """Which observations to keep so that tracks are long, accurate and spread: bool [n].
 
     Args:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Floats
 
 # Width in pixels of the cells of a picture over which velocities are averaged. The velocity of a
 # single track is too noisy for the small corrections here, and neighbouring points move alike.
@@ -16,7 +17,7 @@ _CELL = 32
 _NEAR, _FAR = 2 / 3, -1 / 12
 
 
-def velocities(tracks: Tracks) -> NDArray[np.float64]:
+def velocities(tracks: Tracks) -> Floats:
     """Velocity at each observation in pixels per frame: float64 [num_observations, 2].
 
     It is the derivative of a cubic fitted to the frames up to two away, if the track has all of
@@ -35,7 +36,7 @@ def velocities(tracks: Tracks) -> NDArray[np.float64]:
     return _mean_of_cells(tracks, found)
 
 
-def _mean_of_cells(tracks: Tracks, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mean_of_cells(tracks: Tracks, values: Floats) -> Floats:
     """The mean of values [num_observations, 2] over all observations in the same cell."""
     columns = -(-tracks.width // _CELL) + 2
     rows = -(-tracks.height // _CELL) + 2
@@ -47,7 +48,7 @@ def _mean_of_cells(tracks: Tracks, values: NDArray[np.float64]) -> NDArray[np.fl
     return np.asarray(mean)
 
 
-def _steps(tracks: Tracks, shift: int) -> NDArray[np.float64]:
+def _steps(tracks: Tracks, shift: int) -> Floats:
     """Motion to `shift` frames later: float64 [num_observations, 2]; NaN where it is unknown."""
     found = np.full(tracks.xy.shape, np.nan)
     if tracks.num_observations > shift:
@@ -60,7 +61,7 @@ def _steps(tracks: Tracks, shift: int) -> NDArray[np.float64]:
     return found
 
 
-def _back(steps: NDArray[np.float64], shift: int) -> NDArray[np.float64]:
+def _back(steps: Floats, shift: int) -> Floats:
     """The motion from `shift` frames earlier, given the motion to `shift` frames later."""
     found = np.full_like(steps, np.nan)
     found[shift:] = steps[: len(steps) - shift]
@@ -72,7 +73,7 @@ def at_middle_of_read_out(
     velocity: NDArray[np.floating],
     place: NDArray[np.floating],
     read_out: float,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Positions of points in the middle of the read-out, given those when their row is read.
 
     Args:
@@ -85,9 +86,7 @@ def at_middle_of_read_out(
     return np.asarray(xy - read_out * place[:, None] * velocity, dtype=np.float64)
 
 
-def row_places(
-    xy: NDArray[np.floating], size: tuple[int, int], down: tuple[int, int]
-) -> NDArray[np.float64]:
+def row_places(xy: NDArray[np.floating], size: tuple[int, int], down: tuple[int, int]) -> Floats:
     """Positions [n] of points in the order of read-out, see `at_middle_of_read_out`.
 
     Args:

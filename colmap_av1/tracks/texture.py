@@ -6,9 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.util.arrays import Ints
+
 
 def texture_at(
-    image: NDArray[np.uint8], at: NDArray[np.int64], window: int
+    image: NDArray[np.uint8], at: Ints, window: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The texture around some pixels (x, y) [n, 2] of a picture, see `texture_of`."""
     width = 2 * (window + 1) + 1  # a window around every pixel of a window, and the gradients

@@ -13,6 +13,7 @@ from colmap_av1 import _core
 from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import TrackOptions
+from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.util.progress import Progress, no_progress
@@ -53,11 +54,11 @@ class Tracks:
     num_frames: int
     width: int
     height: int
-    offsets: NDArray[np.int64]
+    offsets: Ints
     frame: NDArray[np.int32]
     xy: NDArray[np.float32]
     sigma: NDArray[np.float32]
-    confirmed: NDArray[np.bool_]
+    confirmed: Bools
 
     @property
     def num_tracks(self) -> int:
@@ -70,12 +71,12 @@ class Tracks:
         return len(self.frame)
 
     @property
-    def lengths(self) -> NDArray[np.int64]:
+    def lengths(self) -> Ints:
         """Number of observations of each track: int64 [num_tracks]."""
         return np.diff(self.offsets)
 
     @property
-    def track(self) -> NDArray[np.int64]:
+    def track(self) -> Ints:
         """Index of the track of each observation: int64 [num_observations]."""
         return np.repeat(np.arange(self.num_tracks), self.lengths)
 
@@ -141,11 +142,11 @@ class Tracks:
             confirmed=np.concatenate([video.confirmed for video in videos]),
         )
 
-    def by_frame(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def by_frame(self) -> tuple[Ints, Ints]:
         """Order of the observations by frame, and the bounds of the frames in it, see `grouped`."""
         return grouped(self.frame, self.num_frames)
 
-    def having(self, observations: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def having(self, observations: Bools) -> Bools:
         """Which tracks have any of these observations: bool [num_tracks].
 
         Args:
@@ -153,7 +154,7 @@ class Tracks:
         """
         return np.logical_or.reduceat(observations, self.offsets[:-1])
 
-    def keep_observations(self, kept: NDArray[np.bool_]) -> Tracks:
+    def keep_observations(self, kept: Bools) -> Tracks:
         """Keep some of the observations.
 
         Args:
@@ -188,7 +189,7 @@ class Tracks:
         seen = self.keep_frames(frames)
         return replace(seen, num_frames=len(frames), frame=number[seen.frame])
 
-    def keep_tracks(self, kept: NDArray[np.bool_]) -> Tracks:
+    def keep_tracks(self, kept: Bools) -> Tracks:
         """Keep some of the tracks, in the same order.
 
         Args:
@@ -276,7 +277,7 @@ class Tracks:
         starts[1:-1] |= np.diff(part) != 0
         return replace(self, offsets=np.flatnonzero(starts).astype(np.int64))
 
-    def split_at_removed(self, kept: NDArray[np.bool_], starts: NDArray[np.bool_]) -> Tracks:
+    def split_at_removed(self, kept: Bools, starts: Bools) -> Tracks:
         """Keep some of the observations, and split tracks where one in between is removed.
 
         Args:
@@ -327,7 +328,7 @@ class Tracks:
             kept &= shown.frame >= 0
         return shown.keep_observations(kept)
 
-    def _take(self, kept: NDArray[np.bool_], offsets: NDArray[np.int64]) -> Tracks:
+    def _take(self, kept: Bools, offsets: Ints) -> Tracks:
         """Some of the observations, in tracks with these offsets."""
         # A position is indexed as one number of eight bytes: rows of two numbers take several times
         # as long.
@@ -447,7 +448,7 @@ def least_length(options: TrackOptions) -> int:
     return _MIN_LENGTH if options.min_length is None else options.min_length
 
 
-def _joined_offsets(sets: Sequence[Tracks]) -> NDArray[np.int64]:
+def _joined_offsets(sets: Sequence[Tracks]) -> Ints:
     """Offsets of the tracks of several sets, one set after the other."""
     return np.cumsum(np.concatenate([[0], *(one.lengths for one in sets)]), dtype=np.int64)
 

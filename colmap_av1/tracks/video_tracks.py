@@ -36,6 +36,7 @@ from colmap_av1.options import (
 from colmap_av1.tracks.overlays import remove_overlays
 from colmap_av1.tracks.refine import refine_spread_tracks, refine_tracks
 from colmap_av1.tracks.tracks import Tracks, build_tracks_and_ends
+from colmap_av1.util.arrays import Floats, Picture
 from colmap_av1.util.files import remove_leftovers, scratch_folder
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.coded_size import coded_size, with_downscale
@@ -45,8 +46,6 @@ from colmap_av1.video.encode import EncodeReport, encode, stream_of
 from colmap_av1.video.facts import Video, read_video
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import FileState
-
-_Image = NDArray[np.uint8]
 
 # Overlay tracks are reported if they are at least this share of all tracks.
 _NOTABLE_SHARE = 0.01
@@ -362,9 +361,7 @@ def count_frames(source: VideoSource, options: ReadOptions) -> int:
     return num_shown if presented is None else int((presented < num_shown).sum())
 
 
-def times_of_frames(
-    source: VideoSource, num_frames: int, options: ReadOptions
-) -> NDArray[np.float64] | None:
+def times_of_frames(source: VideoSource, num_frames: int, options: ReadOptions) -> Floats | None:
     """Times in seconds of the frames that players show: float64 [num_frames]; None if unknown."""
     times = frame_times(source.stream, options)
     presented = source.pictures.presented
@@ -431,7 +428,7 @@ def decodable_frames(
     wanted: Collection[int] | None = None,
     use: str = "tracks are refined",
     kept: KeptPictures | None = None,
-) -> Iterator[tuple[int, _Image]]:
+) -> Iterator[tuple[int, Picture]]:
     """Decode the pictures of the frames that have tracks, and stop with a warning at damage.
 
     Args:

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.util.arrays import Ints
 
-def grouped(
-    key: NDArray[np.integer[Any]], num_groups: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+
+def grouped(key: NDArray[np.integer[Any]], num_groups: int) -> tuple[Ints, Ints]:
     """Group elements by an integer. Within a group they keep their order.
 
     Args:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import BitstreamError, VideoError
+from colmap_av1.util.arrays import Floats
 from colmap_av1.video.container import (
     VideoFile,
     describe,
@@ -163,7 +164,7 @@ def _presented_frames(file: VideoFile, num_entries: int) -> NDArray[np.int32] | 
     return np.flatnonzero([is_shown for _, is_shown in packets]).astype(np.int32)
 
 
-def picture_times(video: Video) -> NDArray[np.float64] | None:
+def picture_times(video: Video) -> Floats | None:
     """Presentation times of all pictures of a video of any codec, also of those hidden by edits.
 
     Returns:

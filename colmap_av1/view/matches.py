@@ -21,7 +21,8 @@ from colmap_av1.database.reading import (
 from colmap_av1.errors import DatabaseError, ImageError
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file
-from colmap_av1.view.pictures import Image, bgr, side_by_side
+from colmap_av1.util.arrays import Picture
+from colmap_av1.view.pictures import bgr, side_by_side
 from colmap_av1.view.video import SHIFT, fixed_point
 
 _MAX_LINES = 300
@@ -31,7 +32,7 @@ def view_database(
     database: str | os.PathLike[str],
     image_path: str | os.PathLike[str],
     pair: Sequence[str] | None = None,
-) -> Image:
+) -> Picture:
     """Draw the matches between two images of a COLMAP database.
 
     Args:
@@ -121,12 +122,12 @@ def _read_pair(
 
 
 def _draw_matches(
-    first: Image,
-    second: Image,
+    first: Picture,
+    second: Picture,
     keypoints1: NDArray[np.float32],
     keypoints2: NDArray[np.float32],
     matches: NDArray[np.uint32],
-) -> Image:
+) -> Picture:
     """Draw matches between two pictures: at most _MAX_LINES, spread over the first picture."""
     height, width = np.maximum(first.shape[:2], second.shape[:2])
     panels = [

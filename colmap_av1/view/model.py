@@ -8,10 +8,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError
-from colmap_av1.view.pictures import Image
+from colmap_av1.util.arrays import Floats, Picture
 from colmap_av1.view.scene import Scene, normalised, read_scene, vertical_view
 from colmap_av1.view.video import SHIFT, fixed_point
 
@@ -23,7 +22,7 @@ _LAST_PORT = 65535
 _PANEL_SIZE = (800, 600)  # (width, height) of each of the four views
 
 
-def view_model(model: str | os.PathLike[str]) -> Image:
+def view_model(model: str | os.PathLike[str]) -> Picture:
     """Draw the points and the camera path of a COLMAP model from three sides and obliquely.
 
     The views frame the cameras and the points with observable depth; other points are dark.
@@ -107,10 +106,10 @@ def serve_model(model: str | os.PathLike[str], *, port: int = 8080) -> Any:
 def _draw_scene(
     scene: Scene,
     title: str,
-    right: NDArray[np.float64],
-    up: NDArray[np.float64],
+    right: Floats,
+    up: Floats,
     size: tuple[int, int],
-) -> Image:
+) -> Picture:
     """Draw an orthographic view with near points over far ones, and the camera path."""
     width, height = size
     towards = np.cross(right, up)

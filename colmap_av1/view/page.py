@@ -19,6 +19,7 @@ from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.geometry.coverage import PosedCamera, coverage
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file
+from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.util.digests import package_version
 from colmap_av1.util.files import check_new_file, output_of_model, whole_file
 from colmap_av1.util.pages import render_page
@@ -29,7 +30,6 @@ if TYPE_CHECKING:  # slow to import
     from colmap_av1.matching.gaps import Gap
     from colmap_av1.reconstruct import ReconstructReport, VideoTimeline
 
-_Floats = NDArray[np.float64]
 Figures = Sequence[tuple[str, str]]
 
 # Largest number of points on a page, evenly spaced in the order of the points; 22 bytes each.
@@ -210,8 +210,8 @@ class _View:
     """
 
     scene: Scene
-    axes: _Floats
-    middle: _Floats
+    axes: Floats
+    middle: Floats
     radius: float
 
     @staticmethod
@@ -223,7 +223,7 @@ class _View:
         radius = float(np.linalg.norm(high - low)) / 2 or 1.0
         return _View(scene, axes, (low + high) / 2, radius)
 
-    def place(self, xyz: _Floats) -> NDArray[np.float32]:
+    def place(self, xyz: Floats) -> NDArray[np.float32]:
         """Page coordinates of points in half diagonals, limited to `_FARTHEST`, float32 [n, 3]."""
         at = (xyz @ self.axes.T - self.middle) / self.radius
         far = np.linalg.norm(at, axis=1, keepdims=True)
@@ -259,7 +259,7 @@ def _xyz(values: Sequence[float]) -> dict[str, float]:
     return {axis: round(value, 5) for axis, value in zip("xyz", values, strict=True)}
 
 
-def _plot(view: _View, shown: NDArray[np.int64], keys: set[str]) -> str:
+def _plot(view: _View, shown: Ints, keys: set[str]) -> str:
     """The 3D view as HTML, including plotly's code; it needs no escaping."""
     plotly = _plotly()
     scene = view.scene
@@ -320,9 +320,7 @@ def _columns(at: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
     return {axis: np.ascontiguousarray(at[:, i]) for i, axis in enumerate("xyz")}
 
 
-def _points(
-    view: _View, name: str, rows: NDArray[np.int64], marker: dict[str, float]
-) -> list[dict[str, Any]]:
+def _points(view: _View, name: str, rows: Ints, marker: dict[str, float]) -> list[dict[str, Any]]:
     if len(rows) == 0:
         return []
     red, green, blue = view.scene.colours[rows].astype(np.int64).T

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, cannot_write
+from colmap_av1.util.arrays import Picture
 from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
 from colmap_av1.util.memory import check_memory
 
-Image = NDArray[np.uint8]
 # Fixed, because x264's output depends on the number of threads.
 _ENCODER_THREADS = 4
 # With `mbtree`, x264's output depends on uninitialized memory.
@@ -50,7 +50,7 @@ def check_picture(
 
 
 def write_picture(
-    picture: Image, output: str | os.PathLike[str], *, overwrite: bool = False
+    picture: Picture, output: str | os.PathLike[str], *, overwrite: bool = False
 ) -> None:
     """Write a picture as PNG or JPEG, depending on the extension.
 
@@ -61,14 +61,14 @@ def write_picture(
     _write_picture(picture, Path(output))
 
 
-def _write_picture(picture: Image, path: Path) -> None:
+def _write_picture(picture: Picture, path: Path) -> None:
     suffix = path.suffix.lower()
     _, encoded = cv2.imencode(suffix, picture)
     with _output(path) as partial:
         partial.write_bytes(encoded.tobytes())
 
 
-def side_by_side(panels: Sequence[Image]) -> Image:
+def side_by_side(panels: Sequence[Picture]) -> Picture:
     """Join pictures of the same size side by side, wide ones above each other."""
     wide = panels[0].shape[1] > panels[0].shape[0]
     return np.asarray(np.concatenate(panels, axis=0 if wide else 1), dtype=np.uint8)
@@ -94,12 +94,12 @@ def existing_pictures(path: Path) -> list[Path]:
 
 
 @contextmanager
-def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], None]]:
+def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Picture], None]]:
     """Write pictures to an .mp4 file, or as numbered files to a folder."""
     if path.suffix.lower() != ".mp4":
         count = 0
 
-        def write_file(picture: Image) -> None:
+        def write_file(picture: Picture) -> None:
             nonlocal count
             _write_picture(picture, path / f"frame_{count:06d}.png")
             count += 1
@@ -119,7 +119,7 @@ def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Image], N
         stream.codec_context.thread_count = _ENCODER_THREADS
         size: tuple[int, int] | None = None
 
-        def write_frame(picture: Image) -> None:
+        def write_frame(picture: Picture) -> None:
             nonlocal size
             # 4:2:0 needs even sizes, and all frames of a video have the same size.
             if size is None:

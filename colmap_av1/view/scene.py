@@ -18,8 +18,7 @@ from colmap_av1.geometry.colmap_model import (
 )
 from colmap_av1.geometry.observable import framed_box, has_observable_depth
 from colmap_av1.images.names import natural_key
-
-_Floats = NDArray[np.float64]
+from colmap_av1.util.arrays import Bools, Floats
 
 _NO_COLOUR = 190
 # Above this cosine of the angle to the vertical, the cameras look straight down or up.
@@ -41,12 +40,12 @@ class Scene:
     """
 
     model: pycolmap.Reconstruction
-    points: _Floats
+    points: Floats
     colours: NDArray[np.uint8]
-    observable: NDArray[np.bool_]
+    observable: Bools
     images: list[ModelImage]
-    centres: _Floats
-    axes: _Floats
+    centres: Floats
+    axes: Floats
 
     @property
     def extent(self) -> float:
@@ -54,7 +53,7 @@ class Scene:
         low, high = self.box(self.axes)
         return float(np.linalg.norm(high - low))
 
-    def box(self, axes: _Floats) -> tuple[_Floats, _Floats]:
+    def box(self, axes: Floats) -> tuple[Floats, Floats]:
         """The framed box along `axes` [d, 3], see `framed_box`."""
         return framed_box(self.points @ axes.T, self.observable, self.centres @ axes.T)
 
@@ -62,7 +61,7 @@ class Scene:
         """The camera of an image."""
         return self.model.cameras[image.camera_id]
 
-    def corners(self, image: ModelImage, size: float) -> _Floats:
+    def corners(self, image: ModelImage, size: float) -> Floats:
         """Corners in the world, float64 [4, 3], of an image plane whose longer side is `size`."""
         camera = self.camera_of(image)
         width, height = camera.width, camera.height
@@ -73,7 +72,7 @@ class Scene:
         return np.asarray((rays * (size / max(width, height)) - translation) @ rotation)
 
 
-def read_scene(model: str | os.PathLike[str], *, up: _Floats | None = None) -> Scene:
+def read_scene(model: str | os.PathLike[str], *, up: Floats | None = None) -> Scene:
     """Read a COLMAP model and find the axes from which to draw it.
 
     Args:
@@ -119,6 +118,6 @@ def vertical_view(scene: Scene) -> tuple[float, float]:
     )
 
 
-def normalised(vector: _Floats) -> _Floats:
+def normalised(vector: Floats) -> Floats:
     """Scale a vector to length 1."""
     return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))

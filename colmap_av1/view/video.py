@@ -15,6 +15,7 @@ from colmap_av1.errors import OptionError
 from colmap_av1.motion.reading import count_with_repeats, first_showings, read_motion
 from colmap_av1.options import ReadOptions, TrackOptions, ViewOptions
 from colmap_av1.tracks.tracks import Tracks, build_tracks
+from colmap_av1.util.arrays import Bools, Ints, Picture
 from colmap_av1.util.files import check_new_file
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.container import open_stream
@@ -22,7 +23,6 @@ from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.unchanged import unchanged
 from colmap_av1.view.pictures import (
-    Image,
     bgr,
     existing_pictures,
     open_pictures,
@@ -135,14 +135,14 @@ class _Drawing:
 
     tracks: Tracks
     options: ViewOptions
-    by_frame: NDArray[np.int64]
-    bounds: NDArray[np.int64]
-    age: NDArray[np.int64]
+    by_frame: Ints
+    bounds: Ints
+    age: Ints
     velocity: NDArray[np.float32]
     full_speed: float
-    has_tail: NDArray[np.bool_]
+    has_tail: Bools
 
-    def seen_in(self, frame: int) -> NDArray[np.int64]:
+    def seen_in(self, frame: int) -> Ints:
         """The observations in a frame."""
         return self.by_frame[self.bounds[frame] : self.bounds[frame + 1]]
 
@@ -169,7 +169,7 @@ def _prepare(tracks: Tracks, options: ViewOptions) -> _Drawing:
     )
 
 
-def _is_spread(tracks: Tracks, spacing: int) -> NDArray[np.bool_]:
+def _is_spread(tracks: Tracks, spacing: int) -> Bools:
     """Choose the tracks to draw as dots with tails, bool [num_tracks].
 
     Chosen is the longest of the tracks that start in a cell of `spacing` pixels within
@@ -188,7 +188,7 @@ def _is_spread(tracks: Tracks, spacing: int) -> NDArray[np.bool_]:
     return chosen
 
 
-def _draw_motion(picture: Image, drawing: _Drawing, frame: int) -> Image:
+def _draw_motion(picture: Picture, drawing: _Drawing, frame: int) -> Picture:
     """Colour every unit with a track by the direction of its motion."""
     height, width = picture.shape[:2]
     rows, cols = -(-height // _UNIT), -(-width // _UNIT)
@@ -207,7 +207,7 @@ def _draw_motion(picture: Image, drawing: _Drawing, frame: int) -> Image:
     return drawn
 
 
-def _draw_tracks(picture: Image, drawing: _Drawing, frame: int) -> Image:
+def _draw_tracks(picture: Picture, drawing: _Drawing, frame: int) -> Picture:
     """Draw a dot for each chosen track, and a tail along its previous positions."""
     drawn = picture.copy()
     seen = drawing.seen_in(frame)
@@ -242,7 +242,7 @@ def _direction_colours(velocity: NDArray[np.floating[Any]]) -> NDArray[np.uint8]
     return bgr(angle / 2, saturation, np.full(len(angle), 255.0))
 
 
-def _direction_wheel(size: int) -> Image:
+def _direction_wheel(size: int) -> Picture:
     """The key to `_direction_colours`: [size, size, 3], black outside the wheel."""
     y, x = np.mgrid[:size, :size]
     offset = np.stack([x, y], axis=-1).reshape(-1, 2) * (2 / max(size - 1, 1)) - 1

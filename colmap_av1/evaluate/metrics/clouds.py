@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
+
+from colmap_av1.util.arrays import Floats
 
 
 @dataclass(frozen=True)
@@ -36,9 +37,7 @@ class CloudDistances:
         return (self.accuracy + self.completeness) / 2
 
 
-def cloud_distances(
-    points: NDArray[np.float64], reference: NDArray[np.float64]
-) -> CloudDistances | None:
+def cloud_distances(points: Floats, reference: Floats) -> CloudDistances | None:
     """Compare two clouds in the same coordinates.
 
     Args:
@@ -66,7 +65,7 @@ def cloud_distances(
     )
 
 
-def point_cloud(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
+def point_cloud(model: pycolmap.Reconstruction) -> Floats:
     """The points of a pycolmap.Reconstruction: float64 [n, 3], in the order of their ids."""
     points = [model.points3D[i].xyz for i in sorted(model.points3D)]
     return np.array(points, dtype=np.float64).reshape(-1, 3)

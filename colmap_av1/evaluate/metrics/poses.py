@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from colmap_av1.errors import ImageError
 from colmap_av1.geometry.alignment import transform_poses
 from colmap_av1.geometry.colmap_model import camera_centres, posed_images
 from colmap_av1.images.names import last_number
+from colmap_av1.util.arrays import Bools, Floats
 from colmap_av1.util.texts import read_lines
 
 # Largest error of an inlier of the robust alignment, in the unit of the ground truth.
@@ -58,9 +58,7 @@ class PoseErrors:
     robust_rms: float
 
 
-def fit_similarity(
-    cam_from_world: NDArray[np.float64], truth: NDArray[np.float64]
-) -> pycolmap.Sim3d | None:
+def fit_similarity(cam_from_world: Floats, truth: Floats) -> pycolmap.Sim3d | None:
     """The similarity that best aligns camera centres with those of other poses (Umeyama 1991).
 
     Args:
@@ -85,9 +83,7 @@ def fit_similarity(
     return pycolmap.Sim3d(found.scale, found.rotation, found * shift - true_shift)
 
 
-def pose_errors(
-    cam_from_world: NDArray[np.float64], truth: NDArray[np.float64]
-) -> PoseErrors | None:
+def pose_errors(cam_from_world: Floats, truth: Floats) -> PoseErrors | None:
     """Compare poses with ground truth after similarity alignment of their centres.
 
     Args:
@@ -125,9 +121,7 @@ def pose_errors(
     )
 
 
-def _robust_distances(
-    centres: NDArray[np.float64], true_centres: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _robust_distances(centres: Floats, true_centres: Floats) -> Floats:
     """Distances [n] of centres after robust similarity alignment; NaN if it fails."""
     centres = centres + _shift_off_origin(centres)
     true_centres = true_centres + _shift_off_origin(true_centres)
@@ -140,7 +134,7 @@ def _robust_distances(
     return np.asarray(np.linalg.norm(moved - true_centres, axis=1))
 
 
-def _shift_off_origin(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _shift_off_origin(points: Floats) -> Floats:
     """A shift [3] of points [n, 3] after which no plane through the origin contains them all.
 
     COLMAP finds no similarity of points in such a plane, as the ground truth of a car often is. All
@@ -151,7 +145,7 @@ def _shift_off_origin(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(sizes[0] * axes[-1] - mean)
 
 
-def image_poses(model: pycolmap.Reconstruction, names: Sequence[str]) -> NDArray[np.float64]:
+def image_poses(model: pycolmap.Reconstruction, names: Sequence[str]) -> Floats:
     """Poses of named images of a model.
 
     Args:
@@ -181,7 +175,7 @@ def frame_number(name: str) -> int:
     return number
 
 
-def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
+def read_poses(path: Path, num_frames: int) -> Floats:
     """Read true poses from lines of `name tx ty tz qx qy qz qw`.
 
     They are camera-to-world poses, with x right, y down, z forward. The number in a name is the
@@ -226,15 +220,13 @@ def read_poses(path: Path, num_frames: int) -> NDArray[np.float64]:
     return cam_from_world
 
 
-def _in_both(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _in_both(a: Floats, b: Floats) -> Bools:
     if a.shape != b.shape:
         raise ValueError(f"got {len(a)} estimated and {len(b)} true poses: give as many of both")
     return np.asarray(np.isfinite(a).all((1, 2)) & np.isfinite(b).all((1, 2)))
 
 
-def _relative_errors(
-    aligned: NDArray[np.float64], truth: NDArray[np.float64]
-) -> tuple[float, float]:
+def _relative_errors(aligned: Floats, truth: Floats) -> tuple[float, float]:
     """RMS errors of translation and rotation (degrees) between consecutive poses."""
     translation, turn = zip(*map(_motions, (aligned, truth)), strict=True)
     distance = np.linalg.norm(translation[0] - translation[1], axis=1)
@@ -242,16 +234,14 @@ def _relative_errors(
     return float(np.sqrt(np.mean(distance**2))), float(np.sqrt(np.mean(angle**2)))
 
 
-def _motions(cam_from_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], Rotation]:
+def _motions(cam_from_world: Floats) -> tuple[Floats, Rotation]:
     """Translation, in the first camera's axes, and rotation between consecutive poses."""
     rotation, step = cam_from_world[:, :, :3], np.diff(camera_centres(cam_from_world), axis=0)
     turn = Rotation.from_matrix(rotation[1:] @ rotation[:-1].transpose(0, 2, 1))
     return np.einsum("nij,nj->ni", rotation[:-1], step), turn
 
 
-def _rotation_errors(
-    estimated: NDArray[np.float64], truth: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _rotation_errors(estimated: Floats, truth: Floats) -> Floats:
     """Angles in degrees between orientations [n, 3, 3] after the best rotation of the world.
 
     The rotation that aligns the centres is not suitable: on a nearly straight path the centres do

@@ -15,14 +15,12 @@ from typing import Any
 import cv2
 import imageio_ffmpeg
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.errors import EvaluationError, ImageError
 from colmap_av1.evaluate.programs import run_program
 from colmap_av1.images.files import read_image
+from colmap_av1.util.arrays import Bools, Floats, Picture
 from colmap_av1.util.processes import bound
-
-_Image = NDArray[np.uint8]
 
 # Patch size in pixels of Zhu and Milanfar's Q, and its significance level: the share of patches of
 # pure noise that count as structure.
@@ -46,12 +44,12 @@ class RenderingMetrics:
         no_lpips: why LPIPS is not available; empty if it is.
     """
 
-    psnr_y: NDArray[np.float64]
-    ssim_db: NDArray[np.float64]
-    vmaf: NDArray[np.float64]
-    sharpness: NDArray[np.float64]
-    sharpness_difference: NDArray[np.float64]
-    lpips: NDArray[np.float64] | None
+    psnr_y: Floats
+    ssim_db: Floats
+    vmaf: Floats
+    sharpness: Floats
+    sharpness_difference: Floats
+    lpips: Floats | None
     no_lpips: str
 
 
@@ -103,7 +101,7 @@ def rendering_metrics(rendered: Sequence[Path], references: Sequence[Path]) -> R
     )
 
 
-def _sharpness(luma: NDArray[np.float64], structure: NDArray[np.bool_]) -> float:
+def _sharpness(luma: Floats, structure: Bools) -> float:
     """Zhu and Milanfar's no-reference sharpness measure Q.
 
     X. Zhu and P. Milanfar, "Automatic Parameter Selection for Denoising Algorithms Using a
@@ -117,7 +115,7 @@ def _sharpness(luma: NDArray[np.float64], structure: NDArray[np.bool_]) -> float
     return float(q[structure].sum() / max(q.size, 1))
 
 
-def _is_structure(luma: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _is_structure(luma: Floats) -> Bools:
     """Bool [rows, cols]: patches whose gradient coherence is too high for pure noise."""
     s1, s2 = _singular_values(luma)
     total = s1 + s2
@@ -126,12 +124,12 @@ def _is_structure(luma: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(coherence > np.sqrt((1 - tail) / (1 + tail)))
 
 
-def _singular_values(luma: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _singular_values(luma: Floats) -> tuple[Floats, Floats]:
     """Singular values of the [64, 2] gradient matrix of each 8x8 patch: [rows, cols] each."""
     dy, dx = (np.asarray(d, dtype=np.float64) for d in np.gradient(luma))
     rows, cols = luma.shape[0] // _PATCH, luma.shape[1] // _PATCH
 
-    def patch_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def patch_sums(values: Floats) -> Floats:
         whole = values[: rows * _PATCH, : cols * _PATCH]
         return np.asarray(whole.reshape(rows, _PATCH, cols, _PATCH).sum(axis=(1, 3)))
 
@@ -141,18 +139,18 @@ def _singular_values(luma: NDArray[np.float64]) -> tuple[NDArray[np.float64], ND
     return np.sqrt(mean + spread), np.sqrt(np.maximum(mean - spread, 0))
 
 
-def _luma(image: _Image) -> NDArray[np.float64]:
+def _luma(image: Picture) -> Floats:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.float64)
 
 
-def _read(path: Path) -> _Image:
+def _read(path: Path) -> Picture:
     try:
         return read_image(path)
     except ImageError as error:
         raise ImageError(f"{error}; render it again") from error
 
 
-def _vmaf(pairs: Sequence[tuple[Path, Path]]) -> NDArray[np.float64]:
+def _vmaf(pairs: Sequence[tuple[Path, Path]]) -> Floats:
     """PSNR-Y, SSIM and VMAF of pairs of image files of the same size: float64 [n, 3]."""
     height, width = _read(pairs[0][0]).shape[:2]
     # Both images are sent in one stream, the rendered image above its reference.
@@ -192,9 +190,7 @@ def _vmaf(pairs: Sequence[tuple[Path, Path]]) -> NDArray[np.float64]:
     return np.array([[frame["metrics"][name] for name in names] for frame in frames])
 
 
-def _lpips(
-    rendered: Sequence[Path], references: Sequence[Path]
-) -> tuple[NDArray[np.float64] | None, str]:
+def _lpips(rendered: Sequence[Path], references: Sequence[Path]) -> tuple[Floats | None, str]:
     """LPIPS of pairs of files, or None and the reason why it is not available."""
     files = [[str(a), str(b)] for a, b in zip(rendered, references, strict=True)]
     try:

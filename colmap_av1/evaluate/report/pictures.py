@@ -12,13 +12,11 @@ import cv2
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
 from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.observable import framed_box
-
-_Image = NDArray[np.uint8]
+from colmap_av1.util.arrays import Bools, Floats, Ints, Picture
 
 # Colours by the family of front-ends, which is a prefix of their names.
 _COLOURS = {
@@ -56,7 +54,7 @@ class View:
         focal_length: focal length in pixels of the images.
     """
 
-    cam_from_world: NDArray[np.float64]
+    cam_from_world: Floats
     depth: float
     focal_length: float
 
@@ -197,7 +195,7 @@ def training_chart(columns: Sequence[Column]) -> bytes | None:
         return _svg(figure)
 
 
-def crop_window(reference: _Image) -> tuple[slice, slice]:
+def crop_window(reference: Picture) -> tuple[slice, slice]:
     """Rows and columns of the window with the strongest edges, a third of the picture's size."""
     grey = cv2.cvtColor(reference, cv2.COLOR_BGR2GRAY).astype(np.float32)
     edges = cv2.magnitude(cv2.Sobel(grey, -1, 1, 0), cv2.Sobel(grey, -1, 0, 1))
@@ -252,7 +250,7 @@ def view_of(cloud: Cloud) -> View:
     return View(tilt @ moved, middle, cloud.focal_length)
 
 
-def draw_perspective(cloud: Cloud, view: View, size: tuple[int, int]) -> _Image:
+def draw_perspective(cloud: Cloud, view: View, size: tuple[int, int]) -> Picture:
     """Points and camera path from a viewpoint: uint8 BGR with the aspect ratio of the images.
 
     Args:
@@ -264,7 +262,7 @@ def draw_perspective(cloud: Cloud, view: View, size: tuple[int, int]) -> _Image:
     width, height = round(size[0] * scale), round(size[1] * scale)
     focal = view.focal_length * scale
 
-    def project(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def project(points: Floats) -> tuple[Ints, Floats]:
         at = points @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
         depth = np.maximum(at[:, 2], 1e-9)
         pixel = at[:, :2] / depth[:, None] * focal + (width / 2, height / 2)
@@ -280,7 +278,7 @@ def draw_perspective(cloud: Cloud, view: View, size: tuple[int, int]) -> _Image:
     return _reduced(picture)
 
 
-def draw_plan(cloud: Cloud, like: Cloud, size: tuple[int, int]) -> _Image:
+def draw_plan(cloud: Cloud, like: Cloud, size: tuple[int, int]) -> Picture:
     """Points and camera path from above: uint8 BGR.
 
     It frames the cameras and the points of observable depth; the others are dark.
@@ -311,11 +309,11 @@ def draw_plan(cloud: Cloud, like: Cloud, size: tuple[int, int]) -> _Image:
 
 
 def _splat(
-    picture: _Image,
-    pixel: NDArray[np.int64],
-    depth: NDArray[np.float64],
+    picture: Picture,
+    pixel: Ints,
+    depth: Floats,
     cloud: Cloud,
-    shown: NDArray[np.bool_],
+    shown: Bools,
 ) -> None:
     """Draw points as squares, near over far; those of assumed depth under all others."""
     height, width = picture.shape[:2]
@@ -330,13 +328,13 @@ def _splat(
     picture[y, x] = colours.repeat(len(offsets), axis=0)
 
 
-def _draw_path(picture: _Image, pixel: NDArray[np.int64]) -> None:
+def _draw_path(picture: Picture, pixel: Ints) -> None:
     line = pixel.astype(np.int32)
     cv2.polylines(picture, [line.reshape(-1, 1, 2)], False, _PATH_COLOUR, 3, cv2.LINE_AA)
     for point in line:
         cv2.circle(picture, point.tolist(), 4, _PATH_COLOUR, -1, cv2.LINE_AA)
 
 
-def _reduced(picture: _Image) -> _Image:
+def _reduced(picture: Picture) -> Picture:
     size = (picture.shape[1] // _OVERSAMPLING, picture.shape[0] // _OVERSAMPLING)
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -13,6 +13,7 @@ from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.evaluate.metrics.clouds import CloudDistances
 from colmap_av1.evaluate.metrics.poses import PoseErrors
 from colmap_av1.evaluate.training.trainers import Training
+from colmap_av1.util.arrays import Bools, Floats
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,10 @@ class Cloud:
         is_aligned: whether the coordinates are those of the reference, not the model's own.
     """
 
-    points: NDArray[np.float64]
+    points: Floats
     colours: NDArray[np.uint8]
-    observable: NDArray[np.bool_]
-    cam_from_world: NDArray[np.float64]
+    observable: Bools
+    cam_from_world: Floats
     focal_length: float
     is_aligned: bool
 

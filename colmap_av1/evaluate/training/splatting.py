@@ -16,6 +16,7 @@ from colmap_av1.errors import ModelError
 from colmap_av1.evaluate.metrics.renderings import RenderingMetrics
 from colmap_av1.geometry.cameras import is_undistorted
 from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.util.arrays import Floats
 
 # The mean distance to this many nearest points is the initial size of a point's Gaussian.
 _NUM_NEIGHBOURS = 3
@@ -135,7 +136,7 @@ def write_scene(model: Path, image_path: Path, path: Path) -> None:
     )
 
 
-def _intrinsics(model: Path, camera: pycolmap.Camera) -> NDArray[np.float64]:
+def _intrinsics(model: Path, camera: pycolmap.Camera) -> Floats:
     if not is_undistorted(camera):
         raise ModelError(
             f"{model}: camera {camera.camera_id} is {camera.model_name}: undistort the images first"
@@ -143,7 +144,7 @@ def _intrinsics(model: Path, camera: pycolmap.Camera) -> NDArray[np.float64]:
     return np.asarray(camera.calibration_matrix())
 
 
-def _spacing(xyz: NDArray[np.float64]) -> NDArray[np.float32]:
+def _spacing(xyz: Floats) -> NDArray[np.float32]:
     """Mean distance of each point to its nearest neighbours."""
     distance, _ = scipy.spatial.KDTree(xyz).query(xyz, k=_NUM_NEIGHBOURS + 1)
     return np.asarray(distance[:, 1:].mean(axis=1), dtype=np.float32)

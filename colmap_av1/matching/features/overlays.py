@@ -9,6 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.matching.features.sift import Features, are_similar
+from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.util.spread import evenly_spread
 
 # Number of images, evenly spread, that each image is compared with.
@@ -63,13 +64,13 @@ def without_overlays(
     return found
 
 
-def _cells(xy: NDArray[np.float32], side: float, columns: int) -> NDArray[np.int64]:
+def _cells(xy: NDArray[np.float32], side: float, columns: int) -> Ints:
     """Number of the square cell of each position, int64 [n]."""
     column, row = np.floor(xy / side).astype(np.int64).T
     return np.asarray(row * columns + column)
 
 
-def _shares_in_place(features: Sequence[Features], width: int) -> list[NDArray[np.float64]]:
+def _shares_in_place(features: Sequence[Features], width: int) -> list[Floats]:
     """The share of the other images in which each feature is fixed, float64 [n] of each image."""
     num_images = len(features)
     compared = evenly_spread(num_images, _NUM_COMPARED)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.matching.features.sift import NUM_DIMENSIONS, Features
+from colmap_av1.util.arrays import Bools
 
 _NUM_WORDS = 64
 # Number of descriptors on which the vocabulary is trained.
@@ -21,7 +22,7 @@ _NUM_ITERATIONS = 10
 
 
 def similar_images(
-    features: Sequence[Features], allowed: NDArray[np.bool_], num_nearest: int, *, seed: int = 0
+    features: Sequence[Features], allowed: Bools, num_nearest: int, *, seed: int = 0
 ) -> NDArray[np.int32]:
     """Pair each image with the images most similar to it.
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.masks import Mask
+from colmap_av1.util.arrays import Bools
 from colmap_av1.video.coded_size import smaller_grey
 
 # Scale of the picture before extraction. SIFT first doubles the size; light features use half the
@@ -37,7 +38,7 @@ class Features:
     xy: NDArray[np.float32]
     descriptors: NDArray[np.float32]
 
-    def only(self, kept: NDArray[np.bool_]) -> Features:
+    def only(self, kept: Bools) -> Features:
         """Select the features where `kept`, bool [n], is True."""
         return Features(self.xy[kept], self.descriptors[kept])
 
@@ -81,7 +82,7 @@ def masked_features(features: Features, picture: NDArray[np.uint8], mask: Mask |
     return features.only(mask.keeps(features.xy, picture.shape[1::-1]))
 
 
-def are_similar(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.bool_]:
+def are_similar(a: NDArray[np.float32], b: NDArray[np.float32]) -> Bools:
     """Whether descriptors [n, 128] match within COLMAP's limit, bool [n]."""
     return np.asarray(np.einsum("ij,ij->i", a, b) >= np.cos(_MAX_ANGLE))
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.features.sift import Features
@@ -16,6 +15,7 @@ from colmap_av1.matching.image_matches import MatchedImages, connected_images
 from colmap_av1.matching.links.matching import Links
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.verify import agreeing_matches
+from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.graphs import connected_components
 
 # Two videos are the same if this number and this share of the examined pictures have their features
@@ -39,7 +39,7 @@ _NUM_WRONG_PROBES = 2
 
 
 def contradicted_gaps(
-    gaps: NDArray[np.int64],
+    gaps: Ints,
     links: Links,
     matched: MatchedImages,
     cameras: Sequence[pycolmap.Camera],
@@ -71,7 +71,7 @@ def contradicted_gaps(
 
 def confirmed_gaps(
     report: LinkReport, suspect: SuspectGaps, matched: MatchedImages, image_set: ImageSet
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Find suspect gaps whose motion the first look contradicts, or that few tracks cross.
 
     If several probes of a video are contradicted, all its gaps are included.
@@ -106,7 +106,7 @@ def confirmed_gaps(
 
 
 def gaps_after_linking(
-    gaps: NDArray[np.int64], contradicted: Sequence[int], merged: MatchedImages, image_set: ImageSet
+    gaps: Ints, contradicted: Sequence[int], merged: MatchedImages, image_set: ImageSet
 ) -> tuple[Gap, ...]:
     """List the gaps of a plan with their reasons."""
     group = connected_images(merged)

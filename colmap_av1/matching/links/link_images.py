@@ -53,6 +53,7 @@ from colmap_av1.matching.links.plan import (
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.options import LinkOptions, PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.spread import evenly_spread
 
@@ -87,7 +88,7 @@ def link_images(
     inter_share: NDArray[np.float32],
     pictures: Pictures,
     *,
-    fast: NDArray[np.bool_],
+    fast: Bools,
     pairs: PairOptions,
     verify: VerifyOptions,
     links: LinkOptions,

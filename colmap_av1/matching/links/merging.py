@@ -14,6 +14,7 @@ from colmap_av1.matching.links.matching import Links
 from colmap_av1.matching.pairs import ImageKeypoints, next_track
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Ints
 from colmap_av1.util.graphs import connected_components
 
 # A feature this close to a track's keypoint, in pixels, is the same keypoint.
@@ -35,7 +36,7 @@ def merge_links(
         used.setdefault(j, set()).update(geometry.inlier_matches[:, 1].tolist())
     num_tracks = next_track(matched.keypoints)
     keypoints = list(matched.keypoints)
-    keypoint: dict[int, NDArray[np.int64]] = {}
+    keypoint: dict[int, Ints] = {}
     for image, indices in used.items():
         keypoints[image], keypoint[image] = _with_features(
             keypoints[image], features[image].xy, sorted(indices), num_tracks
@@ -68,7 +69,7 @@ def merge_links(
 
 def _with_features(
     keypoints: ImageKeypoints, xy: NDArray[np.float32], indices: list[int], first_track: int
-) -> tuple[ImageKeypoints, NDArray[np.int64]]:
+) -> tuple[ImageKeypoints, Ints]:
     """Add some features to keypoints; also return the index of each feature, -1 if not added.
 
     A feature that lies on a track's keypoint joins it; if there are several, the nearest does.

@@ -14,6 +14,7 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.gaps import SuspectGaps, low_inter_gaps, probed_gaps
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.options import LinkOptions
+from colmap_av1.util.arrays import Bools, Ints
 
 # Images to examine on either side of a gap, by their distance from it. The nearest have the most in
 # common, the others determine the scale.
@@ -53,7 +54,7 @@ class Plan:
         effort: effort of feature extraction.
     """
 
-    gaps: NDArray[np.int64]
+    gaps: Ints
     around: list[list[int]]
     loop: list[int]
     between: list[int]
@@ -74,7 +75,7 @@ class Plan:
 
 def images_to_link(
     inter_share: NDArray[np.float32], frames: NDArray[np.int32], options: LinkOptions
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Predict, before matching, which images of a video need pictures because of suspect gaps.
 
     Args:
@@ -117,11 +118,11 @@ def first_look(suspect: SuspectGaps, image_set: ImageSet) -> Plan:
 def plan_links(
     image_set: ImageSet,
     matched: MatchedImages,
-    gaps: NDArray[np.bool_],
+    gaps: Bools,
     images_apart: float,
     options: LinkOptions,
     *,
-    fast: NDArray[np.bool_],
+    fast: Bools,
 ) -> Plan:
     """Choose the pictures to examine at gaps, for loop closures in long videos, and between videos.
 
@@ -163,7 +164,7 @@ def plan_links(
     )
 
 
-def _stretches(chosen: NDArray[np.bool_], image_set: ImageSet) -> tuple[range, ...]:
+def _stretches(chosen: Bools, image_set: ImageSet) -> tuple[range, ...]:
     """Ranges of consecutive images of one video where `chosen`, bool [num_images], is True."""
     found: list[range] = []
     for video in range(len(image_set.videos)):

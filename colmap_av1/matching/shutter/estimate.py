@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.matching.focal import estimate_focal_length, lowest, pose_loss
 from colmap_av1.matching.pairs import ImageKeypoints, pair_matches
 from colmap_av1.tracks.shutter import at_middle_of_read_out, row_places, velocities
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.spread import evenly_spread
-
-_Floats = NDArray[np.float64]
 
 # Read-out times to try, in frame periods; negative if rows are read from the bottom.
 _TRIED = np.linspace(-1.0, 1.0, 17)
@@ -55,11 +53,11 @@ class ReadOut:
 class _View:
     """Matches of a pair of frames: pixels from the centre, velocities, places in the read-out."""
 
-    xy: tuple[_Floats, _Floats]
-    velocity: tuple[_Floats, _Floats]
-    place: tuple[_Floats, _Floats]
+    xy: tuple[Floats, Floats]
+    velocity: tuple[Floats, Floats]
+    place: tuple[Floats, Floats]
 
-    def corrected(self, read_out: float) -> tuple[_Floats, _Floats]:
+    def corrected(self, read_out: float) -> tuple[Floats, Floats]:
         a, b = (
             np.ascontiguousarray(at_middle_of_read_out(xy, velocity, place, read_out))
             for xy, velocity, place in zip(self.xy, self.velocity, self.place, strict=True)

@@ -19,6 +19,7 @@ from colmap_av1.poses.posed_images import FROM_PICTURES, PosedImages, triangulat
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.corners import CornerDensity, follow_corners
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Floats
 from colmap_av1.util.progress import progress_in
 
 # Scale in pixels of the Cauchy loss when an image is resected. It exceeds the distortion by a
@@ -147,10 +148,10 @@ def resect_from_corners(run: Run, corners: Tracks, placed: PosedImages) -> Posed
 
 
 def _error(
-    xy: NDArray[np.float64],
-    xyz: NDArray[np.float64],
+    xy: Floats,
+    xyz: Floats,
     focal: float,
-    cam_from_world: NDArray[np.float64],
+    cam_from_world: Floats,
 ) -> float:
     """Mean reprojection error in pixels, clipped; points behind the camera count as the limit."""
     in_camera = xyz @ cam_from_world[:, :3].T + cam_from_world[:, 3]
@@ -163,7 +164,7 @@ def _are_valid(
     frame: int,
     xy: NDArray[np.float32],
     size: tuple[int, int],
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Whether positions in the picture of a frame are valid; all are if it has no mask."""
     mask = mask_of[frame]
     return mask.keeps(xy, size) if mask is not None else np.ones(len(xy), np.bool_)

@@ -23,13 +23,10 @@ from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.slopes import surface_slopes
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Floats, Ints, Picture
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.threads import map_on_threads
-
-_Floats = NDArray[np.float64]
-_Indices = NDArray[np.int64]
-_Grey = NDArray[np.uint8]
 
 # Width in pixels of the area around a point that the searched image must cover, which is the
 # compared window with a margin, and of the patch that is cut out of the source image.
@@ -71,17 +68,17 @@ class _Patches:
             pixel of the patch.
     """
 
-    xyz: _Floats
-    image: _Indices
-    ray: _Floats
-    surface: _Floats
-    grey: _Grey
-    fraction: _Floats
+    xyz: Floats
+    image: Ints
+    ray: Floats
+    surface: Floats
+    grey: Picture
+    fraction: Floats
 
 
 def match_patches(
     corners: Tracks,
-    view: _Indices,
+    view: Ints,
     points: TriangulatedPoints,
     *,
     views: Sequence[PosedCamera],
@@ -114,7 +111,7 @@ def match_patches(
     patches = _cut(points, middle, image, xy, views=views, pictures=pictures)
     found = [(np.arange(len(points.xyz)), image[middle], xy[middle])]
 
-    def search(number: int) -> tuple[_Indices, _Indices, _Floats]:
+    def search(number: int) -> tuple[Ints, Ints, Floats]:
         followed = by_image[bounds[number] : bounds[number + 1]]
         own, at = point[followed], xy[followed]
         if number not in pictures:
@@ -134,7 +131,7 @@ def match_patches(
 
 
 def _as_tracks(
-    corners: Tracks, frames: NDArray[np.int32], point: _Indices, image: _Indices, xy: _Floats
+    corners: Tracks, frames: NDArray[np.int32], point: Ints, image: Ints, xy: Floats
 ) -> Tracks:
     """Tracks of the points that have enough observations."""
     lengths = np.bincount(point, minlength=1)
@@ -153,9 +150,9 @@ def _as_tracks(
 
 def _cut(
     points: TriangulatedPoints,
-    middle: _Indices,
-    image: _Indices,
-    xy: _Floats,
+    middle: Ints,
+    image: Ints,
+    xy: Floats,
     *,
     views: Sequence[PosedCamera],
     pictures: GreyPictures,
@@ -198,7 +195,7 @@ def _cut(
     return _Patches(xyz, image[middle], ray, surface, grey, fraction)
 
 
-def _scale(view: PosedCamera, size: tuple[int, int]) -> _Floats:
+def _scale(view: PosedCamera, size: tuple[int, int]) -> Floats:
     """Size of an image over the (width, height) of its picture, along x and y."""
     return np.array(view.size) / size
 
@@ -209,9 +206,9 @@ def _found_in(
     view: PosedCamera,
     pictures: GreyPictures,
     *,
-    followed: _Indices,
-    at: _Floats,
-) -> tuple[_Indices, _Floats]:
+    followed: Ints,
+    at: Floats,
+) -> tuple[Ints, Floats]:
     """Search the patches of all points in an image.
 
     Args:
@@ -255,7 +252,7 @@ def _found_in(
 
 def _in_view(
     number: int, patches: _Patches, view: PosedCamera, size: tuple[int, int]
-) -> tuple[_Indices, _Floats, _Floats]:
+) -> tuple[Ints, Floats, Floats]:
     """The points whose patches should look much the same in an image.
 
     Args:
@@ -291,7 +288,7 @@ def _in_view(
     return index[kept], at[kept], change[kept]
 
 
-def _near_views(patches: _Patches, index: _Indices, view: PosedCamera) -> NDArray[np.bool_]:
+def _near_views(patches: _Patches, index: Ints, view: PosedCamera) -> Bools:
     """Whether the viewing angle between an image and the source of each patch is small enough."""
     ray = patches.xyz[index] - view.centre
     cosine = (patches.ray[index] * ray).sum(axis=1) / np.linalg.norm(ray, axis=1)

@@ -9,9 +9,8 @@ are.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-_Floats = NDArray[np.float64]
+from colmap_av1.util.arrays import Floats
 
 # Number of nearest neighbours that a plane is fitted to, including the point itself, and their
 # largest distance in pixels.
@@ -29,7 +28,7 @@ _MIN_NEIGHBOURS = 4.0
 _MAX_SLOPE = 0.01
 
 
-def surface_slopes(xy: _Floats, depth: _Floats, around: _Floats, depth_around: _Floats) -> _Floats:
+def surface_slopes(xy: Floats, depth: Floats, around: Floats, depth_around: Floats) -> Floats:
     """Fit a plane to the neighbours of each point in a picture.
 
     The inverse depth of a plane is linear in the pixels of a pinhole camera. Each plane passes

@@ -17,12 +17,9 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.triangulation import SIGMA_FLOOR, TriangulatedPoints
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.threads import map_on_threads
-
-_Floats = NDArray[np.float64]
-_Ints = NDArray[np.int64]
-_Bools = NDArray[np.bool_]
 
 # Residual of a track, in expected errors, above which it contradicts the poses and below which it
 # agrees with them. Drift causes one to two, a person who walks across the picture five or more.
@@ -79,26 +76,26 @@ class PlacedTracks:
 
     shape: tuple[int, int, int]
     cell: int
-    offsets: _Ints
-    track: _Ints
-    image: _Ints
-    row: _Ints
-    column: _Ints
-    depth: _Floats
-    residual: _Floats
-    xyz: _Floats
+    offsets: Ints
+    track: Ints
+    image: Ints
+    row: Ints
+    column: Ints
+    depth: Floats
+    residual: Floats
+    xyz: Floats
 
     @property
-    def lengths(self) -> _Ints:
+    def lengths(self) -> Ints:
         """Observations of each track, int64 [num_tracks]."""
         return np.diff(self.offsets)
 
-    def mean(self, of_observations: NDArray[np.floating] | _Bools) -> _Floats:
+    def mean(self, of_observations: NDArray[np.floating] | Bools) -> Floats:
         """Means over each track."""
         values = np.asarray(of_observations, dtype=np.float64)
         return np.asarray(np.add.reduceat(values, self.offsets[:-1]) / self.lengths)
 
-    def counts(self, of_tracks: NDArray[np.floating] | _Bools) -> _Floats:
+    def counts(self, of_tracks: NDArray[np.floating] | Bools) -> Floats:
         """Float64 [images, rows, columns] sums over the observations in each cell."""
         _, rows, columns = self.shape
         cell = (self.image * rows + self.row) * columns + self.column
@@ -110,7 +107,7 @@ class PlacedTracks:
 
 def place_tracks(
     tracks: Tracks,
-    image: _Ints,
+    image: Ints,
     points: TriangulatedPoints,
     views: Sequence[PosedCamera],
     *,
@@ -200,19 +197,19 @@ class Contradictions:
             self._kept = list(map_on_threads(self._show, range(len(views)), num_threads))
 
     @property
-    def by_motion(self) -> _Bools:
+    def by_motion(self) -> Bools:
         """Bool [num_tracks] tracks that fit no single point over their whole length."""
         return np.asarray(self._placed.residual > _CONTRADICTS)
 
     @property
-    def surely_by_motion(self) -> _Bools:
+    def surely_by_motion(self) -> Bools:
         """Bool [num_tracks] long tracks with large residuals; drifting tracks are seldom long."""
         placed = self._placed
         return np.asarray(
             (placed.residual > _SURELY_CONTRADICTS) & (placed.lengths >= _SURE_LENGTH)
         )
 
-    def by_depth(self, dynamic: _Bools) -> _Bools:
+    def by_depth(self, dynamic: Bools) -> Bools:
         """Tracks whose points would occlude other points, or are seen through a surface.
 
         Args:
@@ -222,7 +219,7 @@ class Contradictions:
         hiding = self._hiding(agreeing)
         return hiding | self._seen_through(agreeing & ~hiding)
 
-    def unseen(self, left_out: _Bools) -> _Floats:
+    def unseen(self, left_out: Bools) -> Floats:
         """Count the agreeing points that project into each cell of images not observing them.
 
         Args:
@@ -240,7 +237,7 @@ class Contradictions:
         return found
 
     @property
-    def _agreeing(self) -> _Bools:
+    def _agreeing(self) -> Bools:
         placed = self._placed
         return np.asarray((placed.residual < _AGREES) & np.isfinite(placed.xyz[:, 0]))
 
@@ -259,14 +256,14 @@ class Contradictions:
         own = track[unseen].astype(np.int32)
         return _Shown(own, cell[:, 1], cell[:, 0], depth[unseen].astype(np.float32))
 
-    def _hiding(self, agreeing: _Bools) -> _Bools:
+    def _hiding(self, agreeing: Bools) -> Bools:
         from scipy.ndimage import minimum_filter, uniform_filter  # noqa: PLC0415 - slow to import
 
         placed = self._placed
         _, rows, columns = placed.shape
         hides, looked = np.zeros(len(agreeing)), np.zeros(len(agreeing))
 
-        def hiding_in(image: int) -> tuple[NDArray[np.int32], _Bools]:
+        def hiding_in(image: int) -> tuple[NDArray[np.int32], Bools]:
             """The tracks with enough points around them, and whether each would hide those."""
             seen, shown = self._seen[image], self._shown(image)
             own = seen[agreeing[placed.track[seen]]]
@@ -288,19 +285,19 @@ class Contradictions:
             hides[track] += is_nearer
         return (hides > _HIDDEN_SHARE * looked) & (looked >= _MIN_IMAGES)
 
-    def _seen_through(self, agreeing: _Bools) -> _Bools:
+    def _seen_through(self, agreeing: Bools) -> Bools:
         placed = self._placed
         known = placed.depth[np.isfinite(placed.depth)]
         nearest = float(np.quantile(known, 0.001)) if len(known) else 1.0
 
-        def steps(depth: NDArray[np.floating]) -> _Ints:
+        def steps(depth: NDArray[np.floating]) -> Ints:
             with np.errstate(divide="ignore", invalid="ignore"):
                 found = np.floor(np.log(depth / nearest) / np.log(_STEP))
             return np.asarray(np.clip(np.nan_to_num(found), 0, _NUM_STEPS - 1), np.int64)
 
         through = np.zeros(len(agreeing))
 
-        def through_in(image: int) -> tuple[_Ints, _Bools]:
+        def through_in(image: int) -> tuple[Ints, Bools]:
             """The tracks with points, and whether they are seen through a surface."""
             rows, shown = self._seen[image], self._shown(image)
             own = rows[np.isfinite(placed.depth[rows])]
@@ -326,9 +323,9 @@ class Contradictions:
         self,
         row: NDArray[np.integer],
         column: NDArray[np.integer],
-        step: _Ints,
-        at: tuple[_Ints, _Ints, _Ints],
-    ) -> _Ints:
+        step: Ints,
+        at: tuple[Ints, Ints, Ints],
+    ) -> Ints:
         """Count the points around cells whose depth step does not exceed a limit.
 
         Args:

@@ -22,6 +22,7 @@ from colmap_av1.poses.posed_images import FOR_POSES, PosedImages
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.progress import no_progress, progress_in
 
@@ -91,9 +92,7 @@ def follow_behind(
     return found
 
 
-def _on_pictures(
-    run: Run, video: int, tracks: Tracks, expected: NDArray[np.bool_], first_frame: int
-) -> Tracks:
+def _on_pictures(run: Run, video: int, tracks: Tracks, expected: Bools, first_frame: int) -> Tracks:
     """Refine tracks on the pictures of their video; their frames count through all videos."""
     frame = tracks.frame - np.int32(first_frame)
     wanted = frozenset(np.unique(frame).tolist())
@@ -111,11 +110,11 @@ def _on_pictures(
 
 def expect_in_views(
     tracks: Tracks,
-    view: NDArray[np.int64],
+    view: Ints,
     points: TriangulatedPoints,
     views: Sequence[PosedCamera],
     frames: NDArray[np.int32],
-) -> tuple[Tracks, NDArray[np.bool_]]:
+) -> tuple[Tracks, Bools]:
     """Points as tracks, with their projections into views between and after their observations.
 
     Args:

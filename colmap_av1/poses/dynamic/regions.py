@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, make_mask
 from colmap_av1.poses.dynamic.contradictions import Contradictions, PlacedTracks
-
-_Floats = NDArray[np.float64]
-_Bools = NDArray[np.bool_]
+from colmap_av1.util.arrays import Bools, Floats
 
 # Vote of a track that contradicts the poses by its motion alone, and not certainly. It is low
 # because many such tracks arise where nothing guides the encoder, as in the sky.
@@ -47,7 +44,7 @@ _CLOSED = 3
 
 def dynamic_cells(
     placed: PlacedTracks, views: Sequence[PosedCamera], *, num_threads: int | None = None
-) -> _Bools:
+) -> Bools:
     """Find the dynamic cells of images.
 
     Args:
@@ -74,14 +71,14 @@ def dynamic_cells(
     return _closed(strong_patches(cells, share))
 
 
-def _sum_around(cells: _Floats, width: int) -> _Floats:
+def _sum_around(cells: Floats, width: int) -> Floats:
     """Sums over squares of cells in each image."""
     from scipy.ndimage import uniform_filter  # noqa: PLC0415 - slow to import
 
     return np.asarray(uniform_filter(cells, (1, width, width), mode="constant") * width**2)
 
 
-def shares_above_usual(placed: PlacedTracks, votes: _Floats, still: _Bools) -> _Floats:
+def shares_above_usual(placed: PlacedTracks, votes: Floats, still: Bools) -> Floats:
     """Mean vote of the tracks around each cell, less the median over static cells.
 
     Args:
@@ -102,7 +99,7 @@ def shares_above_usual(placed: PlacedTracks, votes: _Floats, still: _Bools) -> _
     return np.where(enough, share - float(np.median(usual)), -1.0)
 
 
-def _sure_regions(placed: PlacedTracks, share: _Floats, behind: _Floats) -> _Bools:
+def _sure_regions(placed: PlacedTracks, share: Floats, behind: Floats) -> Bools:
     """Regions connected in space and time with enough cells that are certainly dynamic.
 
     Args:
@@ -122,7 +119,7 @@ def _sure_regions(placed: PlacedTracks, share: _Floats, behind: _Floats) -> _Boo
     return np.asarray(kept[region])
 
 
-def strong_patches(cells: _Bools, share: _Floats) -> _Bools:
+def strong_patches(cells: Bools, share: Floats) -> Bools:
     """The cells of the patches in which enough cells have high votes."""
     from scipy.ndimage import label  # noqa: PLC0415 - slow to import
 
@@ -136,9 +133,7 @@ def strong_patches(cells: _Bools, share: _Floats) -> _Bools:
     return found
 
 
-def _cells_of_tracks(
-    placed: PlacedTracks, cells: _Bools, contradicts: _Bools
-) -> tuple[_Bools, _Bools]:
+def _cells_of_tracks(placed: PlacedTracks, cells: Bools, contradicts: Bools) -> tuple[Bools, Bools]:
     """The cells in which most tracks are dynamic, and the dynamic tracks."""
     every = _sum_around(placed.counts(np.ones(len(contradicts))), _NEAR)
     dynamic = np.zeros(len(contradicts), np.bool_)
@@ -150,7 +145,7 @@ def _cells_of_tracks(
     return cells, dynamic
 
 
-def _closed(cells: _Bools) -> _Bools:
+def _closed(cells: Bools) -> Bools:
     """The cells with holes in space and time filled, dilated by one."""
     from scipy.ndimage import (  # noqa: PLC0415 - slow to import
         binary_closing,
@@ -170,7 +165,7 @@ def _closed(cells: _Bools) -> _Bools:
     return grown
 
 
-def mask_of_cells(cells: _Bools, cell: int, size: tuple[int, int]) -> Mask:
+def mask_of_cells(cells: Bools, cell: int, size: tuple[int, int]) -> Mask:
     """A mask of (width, height) that excludes cells [rows, columns]."""
     width, height = size
     dynamic = np.repeat(np.repeat(cells, cell, axis=0), cell, axis=1)[:height, :width]

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import ModelPoints
+from colmap_av1.util.arrays import Bools, Ints
 
 # Fewest observations of a point if all of its images have dynamic pixels.
 _MIN_IMAGES = 5
 
 
-def static_points(points: ModelPoints, shows_dynamic: NDArray[np.bool_]) -> NDArray[np.int64]:
+def static_points(points: ModelPoints, shows_dynamic: Bools) -> Ints:
     """The points that are very likely static.
 
     In a few images, a point in uniform motion looks like a static point at another depth: only in

@@ -6,13 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.options.place import End, KnownDistance
-
-_Floats = NDArray[np.float64]
+from colmap_av1.util.arrays import Floats
 
 # Smallest angle in degrees between the rays to a marked point. With a smaller angle its depth is
 # not observable.
@@ -47,7 +45,7 @@ def model_distance(
 
 def _position_of(
     end: End, images: Mapping[str, ModelImage], cameras: Mapping[int, pycolmap.Camera]
-) -> _Floats:
+) -> Floats:
     """Position [3] of an end: a camera centre, or the triangulated point of its marks."""
     missing = next((mark.image for mark in end.marks if mark.image not in images), None)
     if missing is not None:
@@ -85,7 +83,7 @@ def _position_of(
     return np.asarray(position)
 
 
-def _ray(camera: pycolmap.Camera, xy: _Floats) -> _Floats:
+def _ray(camera: pycolmap.Camera, xy: Floats) -> Floats:
     """Unit vector [3] of the ray of a pixel, in camera coordinates."""
     x, y = np.asarray(camera.cam_from_img(xy[None]))[0]
     ray = np.array([x, y, 1.0])

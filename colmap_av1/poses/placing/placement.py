@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.database.reading import PosePrior
 from colmap_av1.geometry.alignment import PathFit, Up, east_north_up, fit_path
@@ -22,11 +21,11 @@ from colmap_av1.poses.placing.up import (
     up_of_gravity,
     up_of_lines,
 )
+from colmap_av1.util.arrays import Floats
 
-_Floats = NDArray[np.float64]
 # Returns the planes of lines that may be vertical, given an approximate up direction, see
 # `vertical_lines`.
-Lines = Callable[[_Floats], Sequence[_Floats]]
+Lines = Callable[[Floats], Sequence[Floats]]
 
 PLACE_FILE = "place.json"
 # Standard errors in radians of the up direction from gravity, and from how the camera was held.
@@ -118,7 +117,7 @@ class Surroundings:
     """
 
     priors: Mapping[str, PosePrior]
-    gravity: _Floats | None = None
+    gravity: Floats | None = None
     lines: Lines | None = None
     place: tuple[float, float, float] | None = None
 
@@ -156,7 +155,7 @@ def find_placement(
 
 
 def _by_positions(
-    images: Sequence[ModelImage], poses: _Floats, known: Surroundings, seed: int
+    images: Sequence[ModelImage], poses: Floats, known: Surroundings, seed: int
 ) -> Placement:
     at = [i for i, image in enumerate(images) if image.name in known.priors]
     priors = [known.priors[images[i].name] for i in at]
@@ -195,7 +194,7 @@ def _by_positions(
     return Placement(fit.similarity, "metres", axes, origin, (how,))
 
 
-def _rough_ups(poses: _Floats, gravity: _Floats | None) -> list[Up]:
+def _rough_ups(poses: Floats, gravity: Floats | None) -> list[Up]:
     """Candidates for up: by gravity, else for cameras held upright and cameras looking down."""
     measured = up_of_gravity(poses, gravity) if gravity is not None else None
     if measured is not None:
@@ -205,7 +204,7 @@ def _rough_ups(poses: _Floats, gravity: _Floats | None) -> list[Up]:
     return [Up(up_of_cameras(poses), _CAMERA_ERROR), Up(back, _CAMERA_ERROR)]
 
 
-def _up(poses: _Floats, known: Surroundings) -> tuple[_Floats, str]:
+def _up(poses: Floats, known: Surroundings) -> tuple[Floats, str]:
     """The up direction, and a description of the data that determined it."""
     measured = up_of_gravity(poses, known.gravity) if known.gravity is not None else None
     if measured is not None:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.database.reading import PosePrior
 from colmap_av1.geometry.alignment import transform_poses
@@ -24,6 +23,7 @@ from colmap_av1.poses.placing.placement import (
 from colmap_av1.poses.placing.up import some_spread, vertical_lines
 from colmap_av1.poses.posed_images import PosedImages, PosesResult, read_posed_images
 from colmap_av1.poses.run import Run
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.stages import Kept, run_stage
 
 
@@ -103,7 +103,7 @@ def _surroundings(
         if np.isfinite(places[i]).all()
     }
 
-    def lines(up: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    def lines(up: Floats) -> list[Floats]:
         images = dict(some_spread([*zip(indices, placed.images, strict=True)]))
         return [
             vertical_lines(

@@ -11,9 +11,9 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.spread import evenly_spread
 
-_Floats = NDArray[np.float64]
 _Item = TypeVar("_Item")
 
 # Weight of the mean up direction of the images compared with the requirement that their x axes are
@@ -35,7 +35,7 @@ _NUM_PICTURES = 12
 _LARGEST_SCATTER = 10.0
 
 
-def up_of_cameras(cam_from_world: _Floats) -> _Floats:
+def up_of_cameras(cam_from_world: Floats) -> Floats:
     """Up direction (unit vector) of cameras [n, 3, 4] that are rolled little.
 
     It is perpendicular to the x axes of the cameras. If these are parallel, it is the perpendicular
@@ -50,7 +50,7 @@ def up_of_cameras(cam_from_world: _Floats) -> _Floats:
     return np.asarray(found if found @ mean >= 0 else -found)
 
 
-def up_of_gravity(cam_from_world: _Floats, gravity: _Floats) -> tuple[_Floats, float] | None:
+def up_of_gravity(cam_from_world: Floats, gravity: Floats) -> tuple[Floats, float] | None:
     """Up direction from gravity, measured in camera axes of unknown order and signs.
 
     Manufacturers define these axes differently, and rotate them with the picture. All 48 orders and
@@ -70,7 +70,7 @@ def up_of_gravity(cam_from_world: _Floats, gravity: _Floats) -> tuple[_Floats, f
         return None
     rotation, gravity = cam_from_world[known, :, :3], gravity[known]
     gravity = gravity / np.linalg.norm(gravity, axis=1, keepdims=True)
-    best: tuple[float, _Floats, float] | None = None
+    best: tuple[float, Floats, float] | None = None
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             seen = gravity[:, order] * signs
@@ -88,8 +88,8 @@ def up_of_gravity(cam_from_world: _Floats, gravity: _Floats) -> tuple[_Floats, f
 
 
 def vertical_lines(
-    picture: NDArray[np.uint8], camera: pycolmap.Camera, pose: _Floats, up: _Floats
-) -> _Floats:
+    picture: NDArray[np.uint8], camera: pycolmap.Camera, pose: Floats, up: Floats
+) -> Floats:
     """Planes through the camera centre and lines in its picture that may be vertical.
 
     Args:
@@ -125,7 +125,7 @@ def some_spread(items: Sequence[_Item]) -> list[_Item]:
     return [items[i] for i in evenly_spread(len(items), _NUM_PICTURES, rounded=True)]
 
 
-def up_of_lines(normals: Iterable[_Floats], up: _Floats) -> _Floats | None:
+def up_of_lines(normals: Iterable[Floats], up: Floats) -> Floats | None:
     """Direction of most lines, by iteratively reweighted least squares with the Cauchy loss.
 
     Args:
@@ -150,7 +150,7 @@ def up_of_lines(normals: Iterable[_Floats], up: _Floats) -> _Floats | None:
     return np.asarray(found)
 
 
-def rotation_to_up(up: _Floats) -> _Floats:
+def rotation_to_up(up: Floats) -> Floats:
     """The smallest rotation [3, 3] that rotates a unit vector to +z."""
     target = np.array([0.0, 0.0, 1.0])
     axis = np.cross(up, target)

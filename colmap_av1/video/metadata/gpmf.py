@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_av1.util.arrays import Floats
+
 _HEADER = struct.Struct(">4sBBH")
 _NESTED = 0
 _COMPLEX = ord("?")
@@ -42,8 +44,8 @@ class Payload:
         read_out: time in seconds from the first row of a picture to the last; None if not given.
     """
 
-    positions: NDArray[np.float64]
-    gravity: NDArray[np.float64]
+    positions: Floats
+    gravity: Floats
     read_out: float | None
 
 
@@ -67,7 +69,7 @@ def read_payload(data: bytes) -> Payload:
     return Payload(positions, gravity, read_out)
 
 
-_Stream = list[tuple[str, NDArray[np.float64]]]
+_Stream = list[tuple[str, Floats]]
 
 
 def _streams(data: bytes, depth: int = 0) -> Iterator[_Stream]:
@@ -102,7 +104,7 @@ def _items(data: bytes) -> Iterator[tuple[str, int, int, bytes]]:
         at += -(-size * count // 4) * 4
 
 
-def _numbers(body: bytes, letters: str | None, size: int) -> NDArray[np.float64] | None:
+def _numbers(body: bytes, letters: str | None, size: int) -> Floats | None:
     """float64 [n, k], n elements of k numbers; None if the elements are not numbers."""
     if not letters or size == 0 or any(letter not in _NUMBERS for letter in letters):
         return None
@@ -118,7 +120,7 @@ def _numbers(body: bytes, letters: str | None, size: int) -> NDArray[np.float64]
     return np.column_stack(columns)
 
 
-def _scaled(values: NDArray[np.float64], named: dict[str, NDArray[np.float64]]) -> Any:
+def _scaled(values: Floats, named: dict[str, Floats]) -> Any:
     """The numbers in their units: divided by SCAL, which has one divisor or one per column."""
     scale = named.get("SCAL", np.ones(1)).ravel()
     if len(scale) not in (1, values.shape[1]) or not scale.all():
@@ -126,7 +128,7 @@ def _scaled(values: NDArray[np.float64], named: dict[str, NDArray[np.float64]]) 
     return values / scale
 
 
-def _with_fix(positions: NDArray[np.float64], named: dict[str, NDArray[np.float64]]) -> Any:
+def _with_fix(positions: Floats, named: dict[str, Floats]) -> Any:
     fix = named.get("GPSF")
     has_fix = fix is None or (fix.size > 0 and fix.flat[-1] >= _MIN_FIX)
     return positions if has_fix else np.full_like(positions, np.nan)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from colmap_av1.util.arrays import Bools, Floats
 
 
-def are_places(places: NDArray[np.float64]) -> NDArray[np.bool_]:
+def are_places(places: Floats) -> Bools:
     """Which positions (latitude, longitude, altitude), float64 [n, 3], are valid for a camera.
 
     Latitude and longitude 0 are invalid, because receivers write them without a fix.

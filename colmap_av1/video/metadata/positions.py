@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
+from colmap_av1.util.arrays import Floats
 from colmap_av1.util.texts import shown
 from colmap_av1.video.container import VideoFile, open_container, until_damage
 from colmap_av1.video.metadata.gpmf import Payload, read_payload
@@ -65,11 +65,11 @@ class Positions:
     """
 
     source: str
-    times: NDArray[np.float64]
-    places: NDArray[np.float64]
+    times: Floats
+    places: Floats
     place: tuple[float, float, float] | None
-    gravity_times: NDArray[np.float64]
-    gravity: NDArray[np.float64]
+    gravity_times: Floats
+    gravity: Floats
     stream: int | None = None
     first_picture: float = 0.0
     left_out: str | None = None
@@ -113,9 +113,7 @@ def read_positions(video: VideoFile) -> Positions | None:
     return Positions(str(video), *nothing, place, *nothing) if place is not None else None
 
 
-def interpolate(
-    times: NDArray[np.float64], known_times: NDArray[np.float64], known: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def interpolate(times: Floats, known_times: Floats, known: Floats) -> Floats:
     """Interpolate known values linearly; NaN before the first, after the last, and in long gaps.
 
     Args:
@@ -249,7 +247,7 @@ def _has_receiver(payload: bytes) -> bool:
     return any(key in payload for key in (b"GPS5", b"GPS9", b"GPSF"))
 
 
-def _left_out(source: str, refused: NDArray[np.float64], unreadable: int = 0) -> str | None:
+def _left_out(source: str, refused: Floats, unreadable: int = 0) -> str | None:
     """The message for ignored positions [n, 3]; None if there are only positions without a fix."""
     count = int((np.nan_to_num(refused[:, :2]) != 0).any(axis=1).sum()) + unreadable
     if count == 0:
@@ -259,8 +257,8 @@ def _left_out(source: str, refused: NDArray[np.float64], unreadable: int = 0) ->
 
 def _spread(
     payloads: Sequence[tuple[float, float, Payload]],
-    of: Callable[[Payload], NDArray[np.float64]],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    of: Callable[[Payload], Floats],
+) -> tuple[Floats, Floats]:
     """Times and values of the samples of all packets, spaced evenly within each packet."""
     times = [np.empty(0)]
     values = [np.empty((0, 3))]
@@ -314,9 +312,7 @@ def _of_texts(
     return Positions(source, *path, None, *nothing, stream=stream, left_out=left_out)
 
 
-def _ascending(
-    times: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _ascending(times: Floats, values: Floats) -> tuple[Floats, Floats]:
     """Sort by time, and keep one value per time."""
     at, first = np.unique(times, return_index=True)
     return at, values[first]

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_av1.util.arrays import Floats
 from colmap_av1.video.metadata.places import are_places
 
 _NUMBER = r"[+-]?\d+(?:\.\d+)?"
@@ -109,7 +109,7 @@ def read_position(text: str) -> WrittenPosition | None:
 
 def to_places(
     written: Sequence[WrittenPosition], place: tuple[float, float, float] | None
-) -> tuple[NDArray[np.float64], str | None]:
+) -> tuple[Floats, str | None]:
     """Latitude, longitude and altitude of the positions of one video.
 
     The format determines the order and unit of the angles, unless that makes most positions
@@ -140,9 +140,7 @@ def to_places(
     return places, doubt
 
 
-def _readings(
-    angles: NDArray[np.float64], order: Order
-) -> tuple[list[NDArray[np.float64]], str, bool]:
+def _readings(angles: Floats, order: Order) -> tuple[list[Floats], str, bool]:
     """Possible interpretations of angles [n, 2].
 
     Returns:
@@ -166,8 +164,8 @@ def _readings(
 
 
 def _choose(
-    readings: list[NDArray[np.float64]], is_certain: bool, place: tuple[float, float, float] | None
-) -> NDArray[np.float64] | None:
+    readings: list[Floats], is_certain: bool, place: tuple[float, float, float] | None
+) -> Floats | None:
     """The interpretation that range, video and format agree on; None if two remain."""
     known = (readings[0] != 0).any(axis=1)
     if len(readings) == 1 or not known.any():
@@ -185,7 +183,7 @@ def _choose(
     return None
 
 
-def _degrees_apart(angles: NDArray[np.float64], place: tuple[float, float, float]) -> float:
+def _degrees_apart(angles: Floats, place: tuple[float, float, float]) -> float:
     north = angles[:, 0] - place[0]
     east = (angles[:, 1] - place[1] + 180) % 360 - 180
     return float(np.hypot(north, east * np.cos(np.radians(place[0]))).min())

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_av1.util.arrays import Floats
 from colmap_av1.video.container import VideoFile, open_container, read_file
 from colmap_av1.video.metadata.positions import Positions, read_positions
 
@@ -74,6 +74,6 @@ def loss_of(video: VideoFile, found: Positions | None, stream: Path) -> str | No
     )
 
 
-def _are_alike(times: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
+def _are_alike(times: Floats, others: Floats) -> bool:
     """Whether times are equal up to less than a frame."""
     return len(times) == len(others) and bool((np.abs(times - others) < _SAME_TIME).all())
