@@ -9,19 +9,18 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 
 from colmap_av1.errors import ModelError, WriteError, cannot_write
 from colmap_av1.geometry.colmap_model import (
     MODEL_FILES,
     ModelImage,
-    ModelPoints,
     posed_images,
     read_model,
     write_model,
 )
 from colmap_av1.geometry.coverage import PosedCamera, coverage, coverage_of_model, views_of
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.track_points import (
     LEAST_AGREEING,
     Colours,
@@ -185,16 +184,14 @@ def densify(
             points = triangulate_tracks(
                 seen,
                 view,
-                [own.camera for own in views],
-                [own.cam_from_world for own in views],
-                None,
+                views,
                 options=options.triangulate,
                 num_threads=options.match.run.num_threads,
                 progress=progress,
             )
         agreeing = _agreement(model, points)
         of_tracks = fitting_in_images(
-            to_model_points(points, view, seen.xy[points.observation].astype(np.float64)),
+            to_model_points(points, view, seen),
             views,
             options.triangulate.max_reprojection_error,
         )

@@ -11,7 +11,8 @@ from dense_scene import SCENE, Truth
 
 from colmap_av1.densify import densify
 from colmap_av1.errors import ImageError, ModelError, OptionError, VideoError
-from colmap_av1.geometry.colmap_model import ModelImage, no_points, write_model
+from colmap_av1.geometry.colmap_model import ModelImage, write_model
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.options import DensifyOptions, ImageOptions, MatchOptions, TriangulateOptions
 from colmap_av1.video.decoding import decode_frames
 
@@ -23,7 +24,7 @@ def true_model(folder: Path, truth: Truth, frames: range, *, shuffle: int = 1) -
         ModelImage(100 - i, f"{frame:04d}.png", 7, truth.cam_from_world[frame * shuffle % 60])
         for i, frame in enumerate(frames)
     ]
-    write_model(folder, {7: truth.camera}, images, no_points())
+    write_model(folder, {7: truth.camera}, images, ModelPoints.empty())
     return folder
 
 
@@ -118,7 +119,7 @@ def model_of_clip(folder: Path) -> Path:
         ModelImage(i + 1, f"{i}.png", 1, np.column_stack([np.eye(3), [-i, 0, 0]]))
         for i in range(16)
     ]
-    write_model(folder, {1: camera}, images, no_points())
+    write_model(folder, {1: camera}, images, ModelPoints.empty())
     return folder
 
 
@@ -148,7 +149,7 @@ def test_densify_refuses_mismatched_models(truth: Truth, clip: Path, tmp_path: P
     with pytest.raises(ModelError, match="no COLMAP model"):
         densify(tmp_path, SCENE, tmp_path / "dense")
     (tmp_path / "empty").mkdir()
-    write_model(tmp_path / "empty", {7: truth.camera}, [], no_points())
+    write_model(tmp_path / "empty", {7: truth.camera}, [], ModelPoints.empty())
     with pytest.raises(ModelError, match="registered"):
         densify(tmp_path / "empty", SCENE, tmp_path / "dense")
     few = true_model(tmp_path / "few", truth, range(20))

@@ -17,7 +17,8 @@ import pytest
 from conftest import Encode, make_frames
 
 from colmap_av1.errors import ColmapAv1Error, HlocError, ImageError, ModelError, OptionError
-from colmap_av1.geometry.colmap_model import are_whole, read_model
+from colmap_av1.geometry.binary_files import are_whole
+from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.images.choosing import check_frame_list
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import frames_of_images, natural_order

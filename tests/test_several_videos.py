@@ -31,7 +31,8 @@ from colmap_av1.errors import (
     OptionError,
     VideoError,
 )
-from colmap_av1.geometry.colmap_model import no_points, write_model
+from colmap_av1.geometry.colmap_model import write_model
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import count_through
@@ -371,7 +372,7 @@ def test_reconstruct_joins_videos_and_photos_in_one_model(
     adjusted = read_posed_model(made.output / ".stages" / "adjusted.npz")
     posed = tmp_path / "posed"
     posed.mkdir()
-    write_model(posed, adjusted.cameras, adjusted.images, no_points())
+    write_model(posed, adjusted.cameras, adjusted.images, ModelPoints.empty())
     dense = densify(posed, halves, tmp_path / "dense", photos=photos)
     assert dense.num_images == made.num_images
     assert dense.agreeing > 0.9

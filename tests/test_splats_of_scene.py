@@ -14,8 +14,9 @@ from dense_scene import OPTIONS, SCENE, Truth
 
 from colmap_av1.densify import densify
 from colmap_av1.evaluate.metrics.clouds import point_cloud
-from colmap_av1.geometry.colmap_model import ModelImage, camera_centres, no_points, write_model
+from colmap_av1.geometry.colmap_model import ModelImage, camera_centres, write_model
 from colmap_av1.geometry.coverage import coverage_of_model
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.options import DensifyOptions, ImageOptions, MatchOptions, TriangulateOptions
 from colmap_av1.reconstruct import ReconstructReport, reconstruct
 from colmap_av1.video.decoding import decode_frames
@@ -37,7 +38,7 @@ def write_poses(folder: Path, truth: Truth, camera: pycolmap.Camera) -> None:
         ModelImage(i + 1, f"{frame:04d}.png", 7, truth.cam_from_world[frame])
         for i, frame in enumerate(FRAMES)
     ]
-    write_model(folder, {7: camera}, images, no_points())
+    write_model(folder, {7: camera}, images, ModelPoints.empty())
 
 
 @pytest.fixture(scope="module")

@@ -94,7 +94,7 @@ class PosedCamera:
     def _on_rays(self, xy: Floats) -> Bools:
         """Whether pixels [n, 2] are the projections of their rays."""
         # COLMAP gives NaN or the ray of another pixel for those without one.
-        again = np.asarray(self.camera.img_from_cam(self.rays(xy))).reshape(-1, 2)
+        again = self.pixels(self.rays(xy))
         return np.asarray(np.linalg.norm(again - xy, axis=1) <= _SAME_PIXEL)
 
     def keeps(self, xy: Floats) -> Bools:
@@ -106,6 +106,14 @@ class PosedCamera:
         """Rays in camera coordinates of pixels [n, 2], float64 [n, 3] with z = 1."""
         rays = np.asarray(self.camera.cam_from_img(xy)).reshape(-1, 2)
         return np.column_stack([rays, np.ones(len(rays))])
+
+    def in_camera(self, xyz: Floats) -> Floats:
+        """Camera coordinates of points [n, 3] in the world, float64 [n, 3]."""
+        return np.asarray(xyz @ self.cam_from_world[:, :3].T + self.cam_from_world[:, 3])
+
+    def pixels(self, own: Floats) -> Floats:
+        """Projections float64 [n, 2] of points [n, 3] in camera coordinates, in pixels."""
+        return np.asarray(self.camera.img_from_cam(own)).reshape(-1, 2)
 
     def project(self, xyz: Floats) -> tuple[Ints, Floats, Floats]:
         """Project points, and keep those within the image.
@@ -128,7 +136,7 @@ class PosedCamera:
         # Outside the field of view, the distortion model may project points into the image.
         low, high = self._seen_rays or (np.full(2, -np.inf), np.full(2, np.inf))
         index, own = _core.points_in_view(pose, low, high, xyz)
-        xy = np.asarray(self.camera.img_from_cam(own)).reshape(-1, 2)
+        xy = self.pixels(own)
         x, y = xy[:, 0], xy[:, 1]
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         if self._seen_rays is None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from colmap_av1 import _core
-from colmap_av1.geometry.colmap_model import camera_centres, take_rows
+from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.triangulation import (
     ERROR_TO_SIGMA,
     SIGMA_FLOOR,
@@ -20,6 +20,7 @@ from colmap_av1.geometry.triangulation import (
 )
 from colmap_av1.options import TriangulateOptions
 from colmap_av1.util.arrays import Bools, Floats, Ints
+from colmap_av1.util.grouping import take_rows
 
 # Distances with a smaller relative uncertainty determine the depth of the scene.
 _KNOWN = 0.3
@@ -53,8 +54,8 @@ class _Points:
     observation: Ints
 
     @property
-    def owner(self) -> Ints:
-        """Point of each observation."""
+    def point(self) -> Ints:
+        """Index of the point of each observation: int64 [num_observations]."""
         return np.repeat(np.arange(len(self.xyz)), np.diff(self.offsets))
 
     @property
@@ -243,8 +244,8 @@ def _points_far_away(
     middle = tracks.middle
     xyz = seen.origins(middle) + seen.rays(middle) * far
     kept = seen.errors(replace(tracks, xyz=xyz)) <= options.max_reprojection_error
-    owner = tracks.owner[kept]
-    counts = np.bincount(owner, minlength=len(left))
+    point = tracks.point[kept]
+    counts = np.bincount(point, minlength=len(left))
     far_away = _Points(
         xyz, np.zeros(len(left)), np.concatenate([[0], np.cumsum(counts)]), tracks.observation[kept]
     ).take(np.flatnonzero(counts >= options.min_observations))

@@ -9,21 +9,16 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 
 from colmap_av1.errors import ModelError
-from colmap_av1.geometry.colmap_model import (
-    ModelImage,
-    ModelPoints,
-    model_points,
-    no_points,
-    posed_images,
-)
-from colmap_av1.util.arrays import Floats
+from colmap_av1.geometry.colmap_model import ModelImage, model_points, posed_images
+from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.grouping import grouped
 
 
@@ -39,12 +34,28 @@ class PosedModel:
 
     cameras: Mapping[int, pycolmap.Camera]
     images: Sequence[ModelImage]
-    points: ModelPoints = field(default_factory=no_points)
+    points: ModelPoints = field(default_factory=ModelPoints.empty)
 
     @property
     def by_name(self) -> dict[str, ModelImage]:
         """The images by their names."""
         return {image.name: image for image in self.images}
+
+    def some(self, kept: Bools) -> tuple[PosedModel, Ints]:
+        """The model of some of its images, with the points that two or more of them observe.
+
+        Args:
+            kept: bool [num_images].
+
+        Returns:
+            The model, and int64 [n] the indices of its points in this model.
+        """
+        points, left = self.points.keep_observations(kept[self.points.image])
+        index = np.cumsum(kept) - 1
+        images = [image for image, own in zip(self.images, kept, strict=True) if own]
+        used = {image.camera_id for image in images}
+        cameras = {i: camera for i, camera in self.cameras.items() if i in used}
+        return PosedModel(cameras, images, replace(points, image=index[points.image])), left
 
 
 def posed_model(
@@ -60,7 +71,7 @@ def posed_model(
     used = {image.camera_id for image in images}
     # Copied, because pycolmap's cameras are freed with the reconstruction.
     cameras = {i: copy.copy(reconstruction.cameras[i]) for i in sorted(used)}
-    points = model_points(reconstruction, images) if with_points else no_points()
+    points = model_points(reconstruction, images) if with_points else ModelPoints.empty()
     return PosedModel(cameras, images, points)
 
 
@@ -72,7 +83,7 @@ def reprojection_errors(model: PosedModel) -> Floats:
         behind the camera.
     """
     points = model.points
-    xyz = np.repeat(points.xyz, np.diff(points.offsets), axis=0)
+    xyz = points.xyz[points.point]
     errors = np.full(len(points.image), np.inf)
     by_image, bounds = grouped(points.image, len(model.images))
     for image, first, last in zip(model.images, bounds[:-1], bounds[1:], strict=True):

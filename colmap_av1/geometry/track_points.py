@@ -9,16 +9,16 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.colmap_model import ModelPoints, take_points
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.distant_points import splat_points
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.geometry.undistortion import Undistortion
 from colmap_av1.options import TrackOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats, Ints, Picture
 from colmap_av1.util.grouping import grouped
-from colmap_av1.util.progress import Progress
+from colmap_av1.util.progress import Progress, no_progress
 
 # If a smaller share of the tracks agrees with the poses, the model is not of the same video.
 LEAST_AGREEING = 0.5
@@ -90,28 +90,35 @@ def tracks_of_points(
 def triangulate_tracks(
     tracks: Tracks,
     view: Ints,
-    cameras: Sequence[pycolmap.Camera],
-    poses: Sequence[Floats],
-    pinholes: Sequence[pycolmap.Camera] | None,
+    views: Sequence[PosedCamera],
     *,
     options: TriangulateOptions,
     num_threads: int | None,
-    progress: Progress,
+    pinholes: Sequence[pycolmap.Camera] | None = None,
     rays: Floats | None = None,
+    progress: Progress = no_progress,
 ) -> TriangulatedPoints:
     """Triangulate all tracks as `options.points` requests.
 
-    Errors are in pixels of the pinhole cameras if given, else of pinhole cameras with the focal
-    lengths of the images' own, see `fitting_in_images`. `rays` is the result of `rays_of` if
-    already known.
+    Args:
+        tracks: the tracks.
+        view: int64 [num_observations] the image of each observation.
+        views: the images.
+        options: which points.
+        num_threads: number of threads; None: one per CPU.
+        pinholes: pinhole cameras in whose pixels errors are measured; None: pinhole cameras with
+            the focal lengths of the images' own, see `fitting_in_images`.
+        rays: the result of `rays_of` if already known.
+        progress: called with the stage "points".
     """
+    cameras = [own.camera for own in views]
     rays = rays_of(tracks, view, cameras) if rays is None else rays
     shown = cameras if pinholes is None else pinholes
     focal = np.array([[c.focal_length_x, c.focal_length_y] for c in shown])
     num_tracks = tracks.num_tracks
     return (splat_points if options.points == "splats" else triangulate)(
         Observations(tracks.offsets, view, rays, tracks.sigma),
-        Views(np.stack(poses), focal),
+        Views(np.stack([own.cam_from_world for own in views]), focal),
         options,
         num_threads=num_threads,
         progress=lambda done: progress("points", done, num_tracks),
@@ -173,7 +180,7 @@ class Colours:
         most = int(lengths.max(initial=1))
         # Point, luma and observation index are packed in one key, because sorting by one key takes
         # a third of the time of sorting by several.
-        key = np.repeat(np.arange(len(lengths)), lengths) * (_LUMA.sum() * 255 + 1)
+        key = self._points.point * (_LUMA.sum() * 255 + 1)
         key += self._seen.astype(np.int64) @ _LUMA
         key *= most
         key += np.arange(len(key)) - np.repeat(first, lengths)
@@ -200,20 +207,30 @@ def fitting_in_images(
         max_error: largest mean reprojection error in pixels.
     """
     lengths = np.diff(points.offsets)
-    owner = np.repeat(np.arange(len(lengths)), lengths)
+    point = points.point
     order, bounds = grouped(points.image, len(views))
     apart = np.empty(len(points.image))
     for image, view in enumerate(views):
         own = order[bounds[image] : bounds[image + 1]]
-        seen = points.xyz[owner[own]] @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
-        at = np.asarray(view.camera.img_from_cam(seen)).reshape(-1, 2)
+        at = view.pixels(view.in_camera(points.xyz[point[own]]))
         apart[own] = np.linalg.norm(at - points.xy[own], axis=1)
-    error = np.bincount(owner, apart, len(lengths)) / lengths
-    return take_points(replace(points, error=error), np.flatnonzero(error <= max_error))
+    error = np.bincount(point, apart, len(lengths)) / lengths
+    return replace(points, error=error).take(np.flatnonzero(error <= max_error))
 
 
-def to_model_points(points: TriangulatedPoints, view: Ints, xy: Floats) -> ModelPoints:
-    """Convert to black model points; `xy` are the pixels of the points' observations."""
+def to_model_points(
+    points: TriangulatedPoints, view: Ints, tracks: Tracks, xy: Floats | None = None
+) -> ModelPoints:
+    """Convert to black model points.
+
+    Args:
+        points: the points.
+        view: int64 [num_observations] the image of each observation of the tracks.
+        tracks: the tracks that were triangulated.
+        xy: float64 [n, 2] the pixels of the points' observations; None: as in the tracks.
+    """
+    if xy is None:
+        xy = tracks.xy[points.observation].astype(np.float64)
     black = np.zeros((len(points.xyz), 3), np.uint8)
     return ModelPoints(
         points.xyz, black, points.error, points.offsets, view[points.observation], xy

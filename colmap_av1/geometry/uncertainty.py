@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from colmap_av1.geometry.colmap_model import camera_centres, keep_observations
+from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.util.arrays import Floats
 
@@ -78,7 +78,7 @@ def centre_uncertainty(model: PosedModel) -> Floats:
     if every > 1:  # the information of independent observations adds up
         some = np.arange(len(model.points.xyz)) % every == 0
         kept = np.repeat(some, np.diff(model.points.offsets))
-        points, _ = keep_observations(model.points, kept)
+        points, _ = model.points.keep_observations(kept)
         return centre_uncertainty(replace(model, points=points)) / math.sqrt(every)
 
     from scipy.linalg import cholesky, solve_triangular  # noqa: PLC0415 - slow to import

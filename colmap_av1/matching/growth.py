@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 import pycolmap
 
-from colmap_av1.geometry.colmap_model import take_rows
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.mapper_limits import (
     MIN_INLIERS,
@@ -16,7 +15,7 @@ from colmap_av1.matching.mapper_limits import (
 )
 from colmap_av1.util.arrays import Bools, Floats
 from colmap_av1.util.graphs import connected_components
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import grouped, take_rows
 
 
 class Growth:

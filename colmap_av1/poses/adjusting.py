@@ -14,14 +14,8 @@ import numpy as np
 import pycolmap
 
 from colmap_av1.geometry.cameras import as_radial
-from colmap_av1.geometry.colmap_model import (
-    ModelPoints,
-    keep_observations,
-    posed_images,
-    read_model,
-    take_points,
-    write_model,
-)
+from colmap_av1.geometry.colmap_model import posed_images, read_model, write_model
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.options import ReconstructOptions
 from colmap_av1.options.camera import DEFAULT_MODEL
@@ -114,7 +108,7 @@ def adjust_posed(
         ModelError: the adjustment failed.
     """
     used = used_observations(model.points, len(model.images), OBSERVATIONS)
-    points, chosen = keep_observations(model.points, used)
+    points, chosen = model.points.keep_observations(used)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_model(folder, model.cameras, model.images, points)
@@ -140,10 +134,10 @@ def adjust_posed(
     adjusted = PosedModel(
         {i: copy.copy(found.cameras[i]) for i in model.cameras},
         [images[image.name] for image in model.images],
-        replace(take_points(model.points, left), xyz=xyz, error=unknown),
+        replace(model.points.take(left), xyz=xyz, error=unknown),
     )
     ahead = np.isfinite(reprojection_errors(adjusted))
-    points, enough = keep_observations(adjusted.points, ahead)
+    points, enough = adjusted.points.keep_observations(ahead)
     return Adjusted(replace(adjusted, points=points), left[enough])
 
 
@@ -152,13 +146,7 @@ def without_unseen_images(model: PosedModel) -> Adjusted:
     counts = np.bincount(model.points.image, minlength=len(model.images))
     most, share = _FEW_SEEN
     is_seen = counts >= min(most, share * float(np.median(counts)))
-    points, kept = keep_observations(model.points, is_seen[model.points.image])
-    index = np.cumsum(is_seen) - 1
-    images = [image for image, own in zip(model.images, is_seen, strict=True) if own]
-    used = {image.camera_id for image in images}
-    cameras = {i: camera for i, camera in model.cameras.items() if i in used}
-    points = replace(points, image=index[points.image])
-    return Adjusted(PosedModel(cameras, images, points), kept)
+    return Adjusted(*model.some(is_seen))
 
 
 def with_second_distortion(run: Run, model: PosedModel) -> PosedModel:
@@ -233,14 +221,11 @@ def focal_length_errors(model: PosedModel) -> dict[int, float]:
     spread = evenly_spread(num_images, _COVARIANCE_IMAGES)
     _, first = np.unique([image.camera_id for image in model.images], return_index=True)
     some = np.union1d(spread, first)  # each camera has an image
-    place = np.full(num_images, -1)
-    place[some] = np.arange(len(some))
-    points, _ = keep_observations(model.points, place[model.points.image] >= 0)
-    points = replace(points, image=place[points.image])
-    used = used_observations(points, len(some), _COVARIANCE_OBSERVATIONS)
-    points, _ = keep_observations(points, used)
+    part, _ = model.some(np.isin(np.arange(num_images), some))
+    used = used_observations(part.points, len(some), _COVARIANCE_OBSERVATIONS)
+    points, _ = part.points.keep_observations(used)
     with tempfile.TemporaryDirectory() as folder:
-        write_model(Path(folder), model.cameras, [model.images[i] for i in some], points)
+        write_model(Path(folder), part.cameras, part.images, points)
         found = read_model(Path(folder))
     config = pycolmap.BundleAdjustmentConfig()
     for image in found.reg_image_ids():
@@ -285,7 +270,7 @@ def used_observations(points: ModelPoints, num_images: int, mean: float) -> Bool
     # Number of observations if each point keeps at most 1, 2, ... of them.
     at_least = np.cumsum(np.bincount(lengths)[:0:-1])[::-1]
     most = max(_FEWEST_KEPT, 1 + int(np.searchsorted(np.cumsum(at_least), wanted)))
-    point = np.repeat(np.arange(len(lengths)), lengths)
+    point = points.point
     share = np.minimum(1.0, most / lengths)[point]
     place = np.arange(len(point)) - points.offsets[point]
     phase = (0.5 + _PHASE_STEP * point) % 1.0

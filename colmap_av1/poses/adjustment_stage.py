@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from colmap_av1.geometry.cameras import has_long_focal_length
-from colmap_av1.geometry.colmap_model import ModelPoints, joined_points
 from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
 from colmap_av1.geometry.track_points import seen_in, to_model_points
 from colmap_av1.images.image_set import ImageSet
@@ -134,7 +132,7 @@ def adjustment_stage(
             points = [_triangulated_points(run, placed, *own) for own in sets]
             check_agreement(sum(len(own.xyz) for own in points), spread.num_tracks)
             run.progress("adjustment", 0, 1)
-            model = PosedModel(placed.cameras, placed.images, joined_points(points))
+            model = PosedModel(placed.cameras, placed.images, ModelPoints.concatenate(points))
             iterative = len(model.images) >= _ITERATIVE_IMAGES and not is_fast
             adjusted = adjust_posed(run, model, iterative=iterative)
             run.progress("adjustment", 1, 1)
@@ -179,4 +177,4 @@ def _triangulated_points(
     """Triangulated points of tracks in the registered images, without colours."""
     seen, view = seen_in(tracks, placed.frames)
     points = triangulate_in(run, placed, seen, view, options=options)
-    return to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
+    return to_model_points(points, view, seen)

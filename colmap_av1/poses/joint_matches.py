@@ -305,16 +305,7 @@ def _agreeing_motion(run: Run, tracks: Tracks, placed: PosedImages) -> tuple[Tra
     """Motion tracks that have a point, without outliers, and their points."""
     seen, view = seen_in(tracks, placed.frames)
     points = triangulate_in(run, placed, seen, view, options=_POINTS)
-    own = points.observation
-    agreeing = replace(
-        seen,
-        offsets=points.offsets,
-        frame=seen.frame[own],
-        xy=seen.xy[own],
-        sigma=seen.sigma[own],
-        confirmed=seen.confirmed[own],
-    )
-    return agreeing, points.xyz
+    return seen.take(points.observation, points.offsets), points.xyz
 
 
 def _start(tracks: Tracks, points: Floats, placed: PosedImages) -> StartingPair | None:

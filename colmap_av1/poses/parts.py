@@ -18,13 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 
-from colmap_av1.geometry.colmap_model import camera_centres, keep_observations
+from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.geometry.uncertainty import MAX_CERTAIN_ERROR, MAX_IMAGES, centre_uncertainty
 from colmap_av1.images.image_set import ImageSet
@@ -185,11 +184,7 @@ def certain_parts(model: PosedModel, image_set: ImageSet) -> list[AbstractSet[st
 
 def _with_images(model: PosedModel, names: AbstractSet[str]) -> PosedModel:
     """The model of some of its images, with the points that two or more of them observe."""
-    shown = np.array([image.name in names for image in model.images])
-    points, _ = keep_observations(model.points, shown[model.points.image])
-    number = np.cumsum(shown) - 1
-    images = [image for image in model.images if image.name in names]
-    return PosedModel(model.cameras, images, replace(points, image=number[points.image]))
+    return model.some(np.array([image.name in names for image in model.images]))[0]
 
 
 def parts_of(
@@ -220,11 +215,8 @@ def parts_of(
     stretch_of = dict(zip(names, (np.cumsum(starts) - 1).tolist(), strict=True))
     common, scaled = _common_points(model, stretch_of, len(sequence_of))
     if rival is not None:
-        own = model.by_name
-        shown = np.array([image.name in own for image in rival.images])
-        points, _ = keep_observations(rival.points, shown[rival.points.image])
-        rival = replace(rival, points=points)
-        scaled = np.minimum(scaled, _common_points(rival, stretch_of, len(sequence_of))[1])
+        same = _with_images(rival, model.by_name.keys())
+        scaled = np.minimum(scaled, _common_points(same, stretch_of, len(sequence_of))[1])
     is_same = np.equal.outer(sequence_of, sequence_of)
     is_connected = np.where(is_same, scaled >= _WITHIN_VIDEO, common >= _BETWEEN_VIDEOS)
     registered = np.array([image.name for image in model.images])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import ModelImage
+from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, joined_masks
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model
 from colmap_av1.geometry.track_points import triangulate_tracks
@@ -108,13 +109,12 @@ def triangulate_in(
     return triangulate_tracks(
         seen,
         view,
-        placed.camera_of_image,
-        [image.cam_from_world for image in placed.images],
-        pinholes,
+        [PosedCamera(placed.cameras[i.camera_id], i.cam_from_world) for i in placed.images],
         options=options,
         num_threads=run.context.num_threads,
-        progress=progress,
+        pinholes=pinholes,
         rays=rays,
+        progress=progress,
     )
 
 

@@ -238,8 +238,7 @@ def _costs(
     agreeing = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
     if len(agreeing.xyz) == 0:
         return 0.0, 0.0, 0.0
-    xy = seen.xy[agreeing.observation].astype(np.float64)
-    points = to_model_points(agreeing, view, xy)
+    points = to_model_points(agreeing, view, seen)
     adjusted = adjust_posed(run, PosedModel(placed.cameras, placed.images, points)).model
     known_errors = reprojection_errors(known)[in_both][agreeing.observation]
     return (

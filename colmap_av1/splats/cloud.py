@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from colmap_av1 import _core
-from colmap_av1.geometry.colmap_model import ModelPoints, joined_points, take_points
 from colmap_av1.geometry.coverage import (
     CELL,
     PosedCamera,
@@ -15,6 +14,7 @@ from colmap_av1.geometry.coverage import (
     squares_of_cells,
     without_gaps,
 )
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.spread import evenly_spread
 
@@ -75,14 +75,14 @@ def splat_cloud(
     shuffled = np.random.default_rng(0).permutation(len(stage))
     order = np.lexsort((shuffled, stage))[: int((stage < len(_SPACINGS)).sum())]
     if max_points is None:
-        kept = take_points(points, np.sort(order))
-        return joined_points([kept, _filling(kept, images, places)])
+        kept = points.take(np.sort(order))
+        return ModelPoints.concatenate([kept, _filling(kept, images, places)])
     # Filling holes has priority over detail, but needs surfaces that determine their depth.
-    kept = take_points(points, order[: round(_FOR_SURFACES * max_points)])
+    kept = points.take(order[: round(_FOR_SURFACES * max_points)])
     filled = _filling(kept, images, places)
-    filled = take_points(filled, np.arange(min(len(filled.xyz), max_points - len(kept.xyz))))
-    kept = take_points(points, np.sort(order[: max_points - len(filled.xyz)]))
-    return joined_points([kept, filled])
+    filled = filled.take(np.arange(min(len(filled.xyz), max_points - len(kept.xyz))))
+    kept = points.take(np.sort(order[: max_points - len(filled.xyz)]))
+    return ModelPoints.concatenate([kept, filled])
 
 
 def _stages(points: ModelPoints, images: Sequence[PosedCamera]) -> Ints:
@@ -116,7 +116,7 @@ def _filling(kept: ModelPoints, images: Sequence[PosedCamera], places: list[int]
     nearest = [nearest_depth(images[place], kept.xyz) for place in places]
     surfaces = [without_gaps(grid) for grid in nearest]
     usual = _usual_depth(surfaces)
-    filled: list[ModelPoints] = [take_points(kept, np.empty(0, np.int64))]
+    filled: list[ModelPoints] = [kept.take(np.empty(0, np.int64))]
     is_first = [np.empty(0, np.bool_)]
     added = np.empty((0, 3))
     for number in _spread_order(len(places)) * _ROUNDS:
@@ -141,7 +141,7 @@ def _filling(kept: ModelPoints, images: Sequence[PosedCamera], places: list[int]
         there = [i for i in around if 0 <= i < len(images)]
         filled.append(_with_observations(xyz, images, there, places[number]))
     order = np.argsort(~np.concatenate(is_first), kind="stable")
-    return take_points(joined_points(filled), order)
+    return ModelPoints.concatenate(filled).take(order)
 
 
 def _spread_order(count: int) -> list[int]:

@@ -12,9 +12,10 @@ import numpy as np
 import pycolmap
 
 from colmap_av1.geometry.cameras import is_undistorted
-from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, take_points, write_model
+from colmap_av1.geometry.colmap_model import ModelImage, write_model
 from colmap_av1.geometry.coverage import PosedCamera, coverage, views_of
 from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.track_points import (
     Colours,
     fitting_in_images,
@@ -77,8 +78,8 @@ def _tracked_points(
     agreeing = points.num_agreeing / max(points.num_tracks, 1)
     if run.options.undistort:
         xy = on_pinholes(rays[points.observation], view[points.observation], cameras)
-        return to_model_points(points, view, xy), agreeing
-    tracked = to_model_points(points, view, seen.xy[points.observation].astype(np.float64))
+        return to_model_points(points, view, seen, xy), agreeing
+    tracked = to_model_points(points, view, seen)
     most = run.options.triangulate.max_reprojection_error
     return fitting_in_images(tracked, views, most), agreeing
 
@@ -283,7 +284,7 @@ def model_stage(
         with clock.measure("points"):
             tracked, agreeing = _tracked_points(run, placed, views, tracks)
             shows_dynamic = np.array([image.name in dynamic_masks for image in images])
-            tracked = take_points(tracked, static_points(tracked, shows_dynamic))
+            tracked = tracked.take(static_points(tracked, shows_dynamic))
         undistort = _undistortions(placed, cameras)
         cloud = _written_cloud(run, partial / "images", placed, views, tracked, undistort=undistort)
         check_unchanged(*run.files)

@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.colmap_model import ModelPoints, joined_points, no_points, take_points
 from colmap_av1.geometry.coverage import (
     CELL,
     PosedCamera,
@@ -22,6 +21,7 @@ from colmap_av1.geometry.coverage import (
     squares_of_cells,
 )
 from colmap_av1.geometry.masks import make_mask
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.splats.ray_search import (
     LEAST_OTHERS,
     Grey,
@@ -95,7 +95,7 @@ class Sweep:
         self._needed = {image for key in keys for image in (key, *self._others[key])}
         self._left = sorted(keys)
         self._greys: dict[int, Grey] = {}
-        self._found: list[ModelPoints] = [no_points()]
+        self._found: list[ModelPoints] = [ModelPoints.empty()]
         self._threads = ThreadPoolExecutor(num_threads)
 
     def __enter__(self) -> Sweep:
@@ -121,7 +121,7 @@ class Sweep:
         for key in self._left:
             self._look(key)
         self._left = []
-        return joined_points(self._found)
+        return ModelPoints.concatenate(self._found)
 
     def _look(self, key: int) -> None:
         """Sweep an image, if its picture and enough of the others were added."""
@@ -137,7 +137,7 @@ class Sweep:
         swept = swept.take(~_hides(swept, views, self._sequence, self._observed))
         own = _as_points(swept, views)
         exact = own.error <= _MOST_ERROR * greys[key].factor
-        self._found.append(take_points(own, np.flatnonzero(exact)))
+        self._found.append(own.take(np.flatnonzero(exact)))
 
 
 def _nearest_observed(points: ModelPoints, views: Sequence[PosedCamera]) -> list[Floats]:
@@ -243,9 +243,8 @@ def _as_points(swept: Swept, views: Sequence[PosedCamera]) -> ModelPoints:
     images = np.array([swept.image, *swept.others])
     apart = np.zeros(all_seen.shape[:2])
     for row, image in enumerate(images.tolist()):
-        pose = views[image].cam_from_world
-        expected = views[image].camera.img_from_cam(xyz @ pose[:, :3].T + pose[:, 3])
-        apart[row] = np.linalg.norm(all_seen[row] - np.reshape(expected, (-1, 2)), axis=1)
+        expected = views[image].pixels(views[image].in_camera(xyz))
+        apart[row] = np.linalg.norm(all_seen[row] - expected, axis=1)
     # Ordered by point, then by image.
     rows = np.argsort(images)
     sees = np.isfinite(apart[rows]).T

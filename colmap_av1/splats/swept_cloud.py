@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.colmap_model import ModelPoints, joined_points
 from colmap_av1.geometry.coverage import PosedCamera
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.splats.cloud import splat_cloud
 from colmap_av1.splats.sweep import Sweep
 from colmap_av1.util.cpus import threads_or_cpus
@@ -44,4 +44,4 @@ def swept_cloud(
         with clock.measure("sweep"):
             swept = sweep.result()
     with clock.measure("cloud"):
-        return splat_cloud(joined_points([tracked, swept]), views, max_points)
+        return splat_cloud(ModelPoints.concatenate([tracked, swept]), views, max_points)

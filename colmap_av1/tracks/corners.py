@@ -200,18 +200,5 @@ def _as_tracks(guide: Tracks, seen: list[tuple[int, Ints, _Floats]], scale: _Flo
     number = np.concatenate([[], *(n for _, n, _ in seen)]).astype(np.int64)
     xy = np.concatenate([np.empty((0, 2), np.float32), *(at for _, _, at in seen)]) * scale
     frame = np.repeat([f for f, _, _ in seen], [len(n) for _, n, _ in seen]).astype(np.int32)
-    lengths = np.bincount(number)
-    # A stable sort keeps the frames of a track in order.
-    order = np.argsort(number, kind="stable")
-    order = order[lengths[number[order]] >= _MIN_IMAGES]
-    lengths = lengths[lengths >= _MIN_IMAGES]
-    return Tracks(
-        num_frames=guide.num_frames,
-        width=guide.width,
-        height=guide.height,
-        offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
-        frame=frame[order],
-        xy=xy[order].astype(np.float32),
-        sigma=np.full(len(order), _SIGMA * float(scale.max()), np.float32),
-        confirmed=np.ones(len(order), np.bool_),
-    )
+    sigma = _SIGMA * float(scale.max())
+    return guide.of_observations(number, frame, xy, sigma, min_length=_MIN_IMAGES)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,6 +143,41 @@ class Tracks:
             confirmed=np.concatenate([video.confirmed for video in videos]),
         )
 
+    def of_observations(
+        self,
+        track: NDArray[np.integer[Any]],
+        frame: NDArray[np.int32],
+        xy: NDArray[np.floating[Any]],
+        sigma: float,
+        *,
+        min_length: int,
+    ) -> Tracks:
+        """Make other tracks of the same video from their observations.
+
+        Args:
+            track: integers [n] number of the track of each observation. A track is observed at most
+                once in a frame.
+            frame: int32 [n] display index of its frame.
+            xy: [n, 2] its position in pixels.
+            sigma: standard deviation of the positions in pixels.
+            min_length: tracks with fewer observations are dropped.
+
+        Returns:
+            Confirmed tracks, in the order of their numbers.
+        """
+        lengths = np.bincount(track)
+        order = np.lexsort((frame, track))
+        order = order[lengths[track[order]] >= min_length]
+        lengths = lengths[lengths >= min_length]
+        return replace(
+            self,
+            offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+            frame=frame[order].astype(np.int32),
+            xy=xy[order].astype(np.float32),
+            sigma=np.full(len(order), sigma, np.float32),
+            confirmed=np.ones(len(order), np.bool_),
+        )
+
     def by_frame(self) -> tuple[Ints, Ints]:
         """Order of the observations by frame, and the bounds of the frames in it, see `grouped`."""
         return grouped(self.frame, self.num_frames)
@@ -170,7 +206,7 @@ class Tracks:
         np.cumsum(kept, out=so_far[1:])
         lengths = np.diff(so_far[self.offsets].astype(np.int64))
         offsets = np.concatenate([[0], np.cumsum(lengths[lengths > 0])]).astype(np.int64)
-        return self._take(kept, offsets)
+        return self.take(kept, offsets)
 
     def keep_frames(self, frames: NDArray[np.int32]) -> Tracks:
         """Keep the observations in these frames, as `keep_observations`."""
@@ -287,7 +323,7 @@ class Tracks:
         part = np.cumsum(~kept | starts)
         begins = np.ones(int(np.count_nonzero(kept)), dtype=np.bool_)
         begins[1:] = (np.diff(self.track[kept]) != 0) | (np.diff(part[kept]) != 0)
-        return self._take(kept, np.append(np.flatnonzero(begins), len(begins)).astype(np.int64))
+        return self.take(kept, np.append(np.flatnonzero(begins), len(begins)).astype(np.int64))
 
     def scale_to(self, size: tuple[int, int]) -> Tracks:
         """The tracks in pictures that are scaled to another (width, height) in pixels."""
@@ -328,8 +364,13 @@ class Tracks:
             kept &= shown.frame >= 0
         return shown.keep_observations(kept)
 
-    def _take(self, kept: Bools, offsets: Ints) -> Tracks:
-        """Some of the observations, in tracks with these offsets."""
+    def take(self, kept: Bools | Ints, offsets: Ints) -> Tracks:
+        """Some of the observations, in tracks with these offsets.
+
+        Args:
+            kept: bool [num_observations] which are kept, or int64 [n] their indices.
+            offsets: see `Tracks`.
+        """
         # A position is indexed as one number of eight bytes: rows of two numbers take several times
         # as long.
         xy = np.ascontiguousarray(self.xy).view(np.uint64)[:, 0][kept]

@@ -28,6 +28,21 @@ def grouped(key: NDArray[np.integer[Any]], num_groups: int) -> tuple[Ints, Ints]
     return order, bounds
 
 
+def take_rows(offsets: Ints, rows: Ints) -> tuple[Ints, Ints]:
+    """Select rows of data in compressed sparse row form.
+
+    Args:
+        offsets: int64 [num_rows + 1] index of the first element of each row.
+        rows: int64 [n] the rows to select, in this order.
+
+    Returns:
+        int64 [n + 1] offsets of the selected rows, and int64 [m] the indices of their elements.
+    """
+    lengths = offsets[rows + 1] - offsets[rows]
+    taken = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+    return taken, np.arange(taken[-1]) + np.repeat(offsets[rows] - taken[:-1], lengths)
+
+
 def sums_beside_gaps(values: NDArray[Any], reach: int) -> NDArray[Any]:
     """For each gap between neighbours, the sum of up to `reach` values on either side.
 

@@ -27,7 +27,8 @@ from scipy.spatial import KDTree
 from colmap_av1 import DensifyOptions, MatchOptions, TrackOptions, densify
 from colmap_av1.evaluate import run_measured
 from colmap_av1.evaluate.metrics.clouds import point_cloud
-from colmap_av1.geometry.colmap_model import ModelImage, no_points, read_model, write_model
+from colmap_av1.geometry.colmap_model import ModelImage, read_model, write_model
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.options import TriangulateOptions
 
 # Smallest track length of a reference point, and number of nearby reference points to consider.
@@ -136,7 +137,7 @@ def true_model(scene: Any, folder: Path) -> Path:
         ModelImage(frame + 1, f"{frame:04d}.png", 1, pose)
         for frame, pose in enumerate(scene.cam_from_world)
     ]
-    write_model(folder, {1: camera}, images, no_points())
+    write_model(folder, {1: camera}, images, ModelPoints.empty())
     return folder
 
 

@@ -22,7 +22,8 @@ from colmap_av1.evaluate.training.splatting import (
     write_scene,
 )
 from colmap_av1.evaluate.training.trainers import Training, train, write_split
-from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, write_model
+from colmap_av1.geometry.colmap_model import ModelImage, write_model
+from colmap_av1.geometry.model_points import ModelPoints
 
 # A Python with torch, gsplat and pytorch-msssim, which are too large to be always installed.
 TORCH_PYTHON = os.environ.get("COLMAP_AV1_TORCH_PYTHON")

@@ -6,7 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_av1.geometry.colmap_model import ModelPoints
+from colmap_av1.geometry.coverage import PosedCamera
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.track_points import (
     Colours,
     chaining_for_points,
@@ -17,7 +18,6 @@ from colmap_av1.geometry.track_points import (
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.options import TrackOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.progress import no_progress
 
 WIDTH, HEIGHT = 640, 480
 PLAIN = pycolmap.Camera(
@@ -99,12 +99,10 @@ def test_points_are_triangulated_from_several_cameras() -> None:
         return triangulate_tracks(
             replace(seen, xy=xy),
             view,
-            cameras,
-            POSES,
-            pinhole and [pinhole] * len(cameras),
+            [PosedCamera(camera, pose) for camera, pose in zip(cameras, POSES, strict=True)],
             options=TriangulateOptions(),
             num_threads=1,
-            progress=no_progress,
+            pinholes=pinhole and [pinhole] * len(cameras),
         )
 
     exact = found(None, seen.xy)
@@ -145,7 +143,7 @@ def test_model_points_list_the_images_that_observe_them() -> None:
     points = make_points([[4, 1], [0, 3, 5]])
     view = np.array([0, 1, 2, 0, 1, 2])
     xy = np.arange(10.0).reshape(5, 2)
-    made = to_model_points(points, view, xy)
+    made = to_model_points(points, view, make_tracks(np.zeros((1, 6, 2))), xy)
     assert made.image.tolist() == [1, 1, 0, 0, 2]
     assert made.offsets.tolist() == [0, 2, 5]
     assert made.rgb.tolist() == [[0, 0, 0]] * 2

@@ -10,14 +10,8 @@ import pycolmap
 import pytest
 
 from colmap_av1.evaluate import pose_errors
-from colmap_av1.geometry.colmap_model import (
-    ModelImage,
-    ModelPoints,
-    keep_observations,
-    no_points,
-    read_model,
-    write_model,
-)
+from colmap_av1.geometry.colmap_model import ModelImage, read_model, write_model
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel, posed_model
 from colmap_av1.geometry.uncertainty import centre_uncertainty, expected_error
 
@@ -94,7 +88,7 @@ def test_parts_without_common_points_are_uncertain() -> None:
     is_before = made.points.image < half
     kept = (is_before & np.repeat(first < 2, 6)) | (~is_before & np.repeat(first >= 3, 6))
     assert not kept[own & ~is_before].any() or not kept[own & is_before].any()
-    points, _ = keep_observations(made.points, kept)
+    points, _ = made.points.keep_observations(kept)
     assert expected_error(made) < 0.001
     assert expected_error(replace(made, points=points)) > 0.1
 
@@ -102,8 +96,8 @@ def test_parts_without_common_points_are_uncertain() -> None:
 def test_error_is_unknown_where_it_is_not_defined() -> None:
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500, 640, 480)
     made = scene(np.random.default_rng(4), camera)
-    assert expected_error(replace(made, points=no_points())) is None
-    assert expected_error(replace(made, images=made.images[:2], points=no_points())) is None
+    assert expected_error(replace(made, points=ModelPoints.empty())) is None
+    assert expected_error(replace(made, images=made.images[:2], points=ModelPoints.empty())) is None
     behind = replace(made.points, xyz=made.points.xyz * [1, 1, -1])
     assert expected_error(replace(made, points=behind)) is None
     turning = [replace(image, cam_from_world=np.eye(3, 4)) for image in made.images]
@@ -115,11 +109,11 @@ def test_image_with_too_few_points_is_uncertain() -> None:
     made = scene(np.random.default_rng(1), camera)
     whole = centre_uncertainty(made)
     kept = (made.points.image < NUM_IMAGES - 1) | (np.arange(len(made.points.image)) % 18 == 5)
-    points, _ = keep_observations(made.points, kept)
+    points, _ = made.points.keep_observations(kept)
     few = centre_uncertainty(replace(made, points=points))
     assert few.argmax() == NUM_IMAGES - 1
     assert few[-1] > 1.5 * whole[-1]
-    none, _ = keep_observations(made.points, made.points.image < NUM_IMAGES - 1)
+    none, _ = made.points.keep_observations(made.points.image < NUM_IMAGES - 1)
     unknown = centre_uncertainty(replace(made, points=none))
     assert unknown.argmax() == NUM_IMAGES - 1
     assert unknown[-1] > 5 * few[-1]

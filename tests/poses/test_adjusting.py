@@ -17,13 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from colmap_av1 import CameraOptions, MatchOptions, ReconstructOptions
 from colmap_av1.evaluate.metrics.poses import pose_errors
-from colmap_av1.geometry.colmap_model import (
-    ModelImage,
-    ModelPoints,
-    keep_observations,
-    read_model,
-    take_points,
-)
+from colmap_av1.geometry.colmap_model import ModelImage, read_model
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel, posed_model, reprojection_errors
 from colmap_av1.poses import adjusting
 from colmap_av1.poses.adjusting import (
@@ -81,7 +76,7 @@ def test_observations_are_thinned_evenly_over_images() -> None:
 
 def test_points_with_one_observation_are_dropped() -> None:
     points = points_seen_in([[0, 1, 2], [0, 1], [2, 3, 4]])
-    left, index = keep_observations(points, np.array([1, 1, 0, 1, 0, 1, 1, 1], np.bool_))
+    left, index = points.keep_observations(np.array([1, 1, 0, 1, 0, 1, 1, 1], np.bool_))
     assert index.tolist() == [0, 2]
     assert left.offsets.tolist() == [0, 2, 5]
     assert left.image.tolist() == [0, 1, 2, 3, 4]
@@ -110,7 +105,7 @@ def posed_scene(camera: pycolmap.Camera, turn: float) -> PosedModel:
         rows[:, 1].astype(np.int64),
         rows[:, 2:],
     )
-    several = keep_observations(points, np.repeat(counts >= 3, counts))[0]
+    several = points.keep_observations(np.repeat(counts >= 3, counts))[0]
     return PosedModel({1: camera}, images, several)
 
 
@@ -160,7 +155,7 @@ def test_adjustment_recovers_poses_from_half_of_the_observations(
     made: ReconstructReport, truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = posed_model(read_model(made.output / "sparse" / "0"), with_points=True)
-    some = take_points(model.points, np.arange(0, len(model.points.xyz), 5))
+    some = model.points.take(np.arange(0, len(model.points.xyz), 5))
     mean = len(some.image) / len(model.images) / 2
     monkeypatch.setattr(adjusting, "OBSERVATIONS", mean)
     assert not used_observations(some, len(model.images), mean).all()

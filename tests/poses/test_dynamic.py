@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation
 from sequences import model_poses
 
 from colmap_av1.evaluate.metrics.poses import pose_errors
-from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, no_points
+from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, make_mask
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.triangulation import (
     Observations,
     TriangulatedPoints,
@@ -258,7 +259,7 @@ def test_points_of_few_images_are_static_if_one_image_shows_no_motion() -> None:
     assert static_points(points, shows_moving).tolist() == [0, 2, 3, 4]
     assert static_points(points, np.ones(12, np.bool_)).tolist() == [2]
     assert static_points(points, np.zeros(12, np.bool_)).tolist() == [0, 1, 2, 3, 4]
-    assert len(static_points(no_points(), shows_moving)) == 0
+    assert len(static_points(ModelPoints.empty(), shows_moving)) == 0
 
 
 # Width and height in pixels of a poster that moves across the frames of the rendered courtyard.

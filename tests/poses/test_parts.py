@@ -13,12 +13,8 @@ from image_sets import images
 from sequences import model_poses
 
 from colmap_av1.evaluate import pose_errors
-from colmap_av1.geometry.colmap_model import (
-    ModelImage,
-    ModelPoints,
-    keep_observations,
-    read_model,
-)
+from colmap_av1.geometry.colmap_model import ModelImage, read_model
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.parts import certain_parts, parts_of
@@ -94,7 +90,7 @@ def test_only_images_of_the_model_give_its_rival_parallax() -> None:
     image_set, seams, used = images(30), [seam(images(30), 14)], range(4, 30)
     own = [*stretch(4, 14), *stretch(15, 29)]
     whole = model(image_set, [*own, *[[13, 14, 15, 16]] * 200])
-    points, _ = keep_observations(whole.points, np.isin(whole.points.image, used))
+    points, _ = whole.points.keep_observations(np.isin(whole.points.image, used))
     points = replace(points, image=points.image - used.start)
     part = PosedModel(whole.cameras, [whole.images[i] for i in used], points)
     rival = model(image_set, [*own, *[[0, 14, 15, 16]] * 200])

@@ -9,7 +9,8 @@ import pycolmap
 import pytest
 from conftest import Ffmpeg
 
-from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints
+from colmap_av1.geometry.colmap_model import ModelImage
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.geometry.track_points import tracks_of_points
 from colmap_av1.matching.gaps import fast_frames

@@ -17,7 +17,8 @@ from colmap_av1.check.crossings import model_crossings
 from colmap_av1.cli import main
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, read_model, write_model
+from colmap_av1.geometry.colmap_model import ModelImage, read_model, write_model
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import posed_model
 from colmap_av1.options import CameraOptions
 from colmap_av1.poses.seams import Seams, model_seams

@@ -16,7 +16,8 @@ from sequences import model_poses
 from colmap_av1.cli.reports import reconstruct_rows
 from colmap_av1.errors import OptionError
 from colmap_av1.evaluate.metrics.poses import pose_errors
-from colmap_av1.geometry.colmap_model import ModelImage, ModelPoints, read_model
+from colmap_av1.geometry.colmap_model import ModelImage, read_model
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.map import map_database
 from colmap_av1.match import match

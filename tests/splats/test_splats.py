@@ -11,9 +11,10 @@ import pytest
 
 from colmap_av1 import _core
 from colmap_av1.errors import OptionError
-from colmap_av1.geometry.colmap_model import ModelPoints, camera_centres, take_points
+from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.coverage import PosedCamera, coverage
 from colmap_av1.geometry.distant_points import splat_points
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.triangulation import (
     Observations,
     TriangulatedPoints,
@@ -147,7 +148,7 @@ def cloud(xyz: np.ndarray, views: list[PosedCamera]) -> ModelPoints:
     offsets = np.concatenate([[0], np.cumsum(counts)])
     rgb = np.full((len(xyz), 3), 7, np.uint8)
     made = ModelPoints(xyz, rgb, np.full(len(xyz), 0.5), offsets, image, xy)
-    return take_points(made, np.flatnonzero(counts))
+    return made.take(np.flatnonzero(counts))
 
 
 def posed(poses: np.ndarray) -> list[PosedCamera]:

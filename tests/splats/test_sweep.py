@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from colmap_av1 import _core
-from colmap_av1.geometry.colmap_model import ModelPoints, no_points
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import make_mask
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.splats.sweep import Sweep
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
@@ -166,8 +166,8 @@ def test_missing_pictures_are_not_used(left: list[int]) -> None:
 
 
 def test_no_points_or_a_single_image_give_no_points() -> None:
-    assert len(sweep(no_points()).xyz) == 0
-    one = sweep(no_points(), [(0, PICTURES[0])], VIEWS[:1], ONE_VIDEO[:1])
+    assert len(sweep(ModelPoints.empty()).xyz) == 0
+    one = sweep(ModelPoints.empty(), [(0, PICTURES[0])], VIEWS[:1], ONE_VIDEO[:1])
     assert len(one.xyz) == 0
 
 

@@ -140,23 +140,9 @@ def links_as_tracks(
         return Tracks.empty(num_frames, size)
     label = connected_components(total, np.concatenate(ends))
     frame = np.repeat(frames[images], counts)
-    size_of = np.bincount(label, minlength=label.max() + 1)
     order = np.lexsort((frame, label))
-    order = order[size_of[label[order]] >= 2]
     twice = (np.diff(label[order]) == 0) & (np.diff(frame[order]) == 0)
-    ambiguous = np.unique(label[order][1:][twice])
-    order = order[~np.isin(label[order], ambiguous)]
-    starts = np.flatnonzero(np.concatenate([[True], np.diff(label[order]) != 0]))
-    if len(order) == 0:
-        return Tracks.empty(num_frames, size)
+    clear = ~np.isin(label, label[order][1:][twice])
     xy = np.concatenate([features[i].xy for i in images])
-    return Tracks(
-        num_frames=num_frames,
-        width=size[0],
-        height=size[1],
-        offsets=np.append(starts, len(order)).astype(np.int64),
-        frame=frame[order].astype(np.int32),
-        xy=xy[order].astype(np.float32),
-        sigma=np.full(len(order), _SIGMA, np.float32),
-        confirmed=np.ones(len(order), np.bool_),
-    )
+    no_tracks = Tracks.empty(num_frames, size)
+    return no_tracks.of_observations(label[clear], frame[clear], xy[clear], _SIGMA, min_length=2)

@@ -11,7 +11,7 @@ revisited place observe the same points.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -126,26 +126,9 @@ def match_patches(
     for done, matches in enumerate(searched, start=1):
         found.append(matches)
         progress(done)
-    columns = (np.concatenate(column) for column in zip(*found, strict=True))
-    return _as_tracks(corners, frames, *columns)
-
-
-def _as_tracks(
-    corners: Tracks, frames: NDArray[np.int32], point: Ints, image: Ints, xy: Floats
-) -> Tracks:
-    """Tracks of the points that have enough observations."""
-    lengths = np.bincount(point, minlength=1)
-    order = np.lexsort((image, point))
-    order = order[lengths[point[order]] >= _MIN_IMAGES]
-    lengths = lengths[lengths >= _MIN_IMAGES]
-    return replace(
-        corners,
-        offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
-        frame=frames[image[order]],
-        xy=xy[order].astype(np.float32),
-        sigma=np.full(len(order), corners.sigma.max(initial=0.0), np.float32),
-        confirmed=np.ones(len(order), np.bool_),
-    )
+    own, image, at = (np.concatenate(column) for column in zip(*found, strict=True))
+    sigma = float(corners.sigma.max(initial=0.0))
+    return corners.of_observations(own, frames[image], at, sigma, min_length=_MIN_IMAGES)
 
 
 def _cut(

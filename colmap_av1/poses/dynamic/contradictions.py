@@ -123,9 +123,8 @@ def place_tracks(
         cell: width of a cell in pixels.
     """
     offsets = tracks.offsets
-    num_tracks = len(offsets) - 1
-    track = np.repeat(np.arange(num_tracks), np.diff(offsets))
-    xyz = np.full((num_tracks, 3), np.nan)
+    track = tracks.track
+    xyz = np.full((tracks.num_tracks, 3), np.nan)
     sizes = np.diff(points.offsets)
     order = np.argsort(sizes, kind="stable")
     owner = track[points.observation[points.offsets[:-1]]]
@@ -135,12 +134,10 @@ def place_tracks(
     for number, view in enumerate(views):
         own = by_image[bounds[number] : bounds[number + 1]]
         own = own[np.isfinite(xyz[track[own], 0])]
-        pose = view.cam_from_world
-        local = xyz[track[own]] @ pose[:, :3].T + pose[:, 3]
+        local = view.in_camera(xyz[track[own]])
         ahead = local[:, 2] > 0
         own, local = own[ahead], local[ahead]
-        seen = np.asarray(view.camera.img_from_cam(local)).reshape(-1, 2)
-        error[own] = np.linalg.norm(seen - tracks.xy[own], axis=1)
+        error[own] = np.linalg.norm(view.pixels(local) - tracks.xy[own], axis=1)
         depth[own] = local[:, 2]
     expected = np.hypot(SIGMA_FLOOR, tracks.sigma)
     ratio = np.minimum(np.nan_to_num(error / expected, nan=_MAX_RESIDUAL), _MAX_RESIDUAL)

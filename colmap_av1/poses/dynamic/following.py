@@ -24,7 +24,7 @@ from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.grouping import grouped
-from colmap_av1.util.progress import no_progress, progress_in
+from colmap_av1.util.progress import progress_in
 
 # Number of images after the last observation of a point in which it is searched; later its
 # surroundings look too different.
@@ -74,12 +74,9 @@ def follow_behind(
         points = triangulate_tracks(
             seen,
             view,
-            [v.camera for v in views],
-            [v.cam_from_world for v in views],
-            None,
+            views,
             options=FOR_POSES,
             num_threads=run.context.num_threads,
-            progress=no_progress,
         )
         if len(points.xyz) == 0:  # the camera of this video stands still
             continue

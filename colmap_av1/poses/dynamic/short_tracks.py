@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from colmap_av1.geometry.colmap_model import ModelPoints
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.util.arrays import Bools, Ints
 
 # Fewest observations of a point if all of its images have dynamic pixels.

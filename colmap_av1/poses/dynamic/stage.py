@@ -21,7 +21,6 @@ from colmap_av1.poses.posed_images import PosedImages, PosesResult, read_posed_i
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks, least_length
-from colmap_av1.util.progress import no_progress
 from colmap_av1.util.stages import Kept, run_stage
 
 _FILE = "dynamic.npz"
@@ -161,12 +160,9 @@ def _dynamic_masks(
     points = triangulate_tracks(
         seen,
         image,
-        [view.camera for view in views],
-        [view.cam_from_world for view in views],
-        None,
+        views,
         options=how,
         num_threads=num_threads,
-        progress=no_progress,
     )
     placed_tracks = place_tracks(seen, image, points, views, cell=cell)
     cells = dynamic_cells(placed_tracks, views, num_threads=num_threads)
