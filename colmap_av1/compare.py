@@ -300,6 +300,7 @@ def _trained(
         progress(stage, 0, 1)
         split = write_split(column.model_path, footage.image_path, folder / "split")
         if options.trainer is None:
+            progress(stage, 1, 1)
             return column
         training = train(
             options.trainer,

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from colmap_av1.errors import ModelError
-from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.coverage import coverage_of_model
 from colmap_av1.geometry.posed_model import posed_model
 
@@ -25,7 +23,6 @@ class ModelFigures:
         coverage: share of the images' cells of 16x16 pixels into which visible points project.
         mean_error: mean reprojection error of the points in pixels, as in COLMAP.
         median_error: median reprojection error of the points in pixels.
-        focal_length: mean focal length of the cameras in pixels.
         focal_lengths: shortest and longest focal length of the cameras in pixels.
     """
 
@@ -35,18 +32,15 @@ class ModelFigures:
     coverage: float
     mean_error: float
     median_error: float
-    focal_length: float
     focal_lengths: tuple[float, float]
 
 
-def model_figures(model: pycolmap.Reconstruction | Path) -> ModelFigures:
-    """Compute the figures of a model, given as pycolmap.Reconstruction or as a folder.
+def model_figures(model: pycolmap.Reconstruction) -> ModelFigures:
+    """Compute the figures of a model.
 
     Raises:
-        ModelError: the folder has no readable model, or the model has no poses.
+        ModelError: the model has no registered images.
     """
-    if isinstance(model, Path):
-        model = read_model(model)
     posed = posed_model(model)
     if not posed.images:
         raise ModelError("the model has no registered image")
@@ -60,6 +54,5 @@ def model_figures(model: pycolmap.Reconstruction | Path) -> ModelFigures:
         coverage=coverage_of_model(model),
         mean_error=float(known.mean()) if len(known) else float("nan"),
         median_error=float(np.median(known)) if len(known) else float("nan"),
-        focal_length=float(np.mean(focal_lengths)),
         focal_lengths=(min(focal_lengths), max(focal_lengths)),
     )

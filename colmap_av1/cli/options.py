@@ -11,7 +11,15 @@ from typing import Any, TypeVar
 
 from colmap_av1.cli.parser import Parser
 from colmap_av1.errors import OptionError
-from colmap_av1.options.fields import Options, declared_of, field_types, is_path, members_of
+from colmap_av1.options.fields import (
+    Options,
+    declared_of,
+    field_types,
+    is_path,
+    members_of,
+    unused_in,
+)
+from colmap_av1.options.words import word_of
 
 _Options = TypeVar("_Options", bound=Options)
 _Number = TypeVar("_Number", int, float)
@@ -115,10 +123,8 @@ def _parts(options: Options, name: str, unused: Collection[str]) -> Iterator[tup
     parts = [f for f in used if isinstance(getattr(options, f.name), Options)]
     yield options, _Path(name, [f for f in used if f not in parts])
     for field in parts:
-        start = f"{field.name}."
-        below = {path.removeprefix(start) for path in unused if path.startswith(start)}
         part = getattr(options, field.name)
-        yield from _parts(part, f"{name}.{field.name}", below | declared_of(field).unused)
+        yield from _parts(part, f"{name}.{field.name}", unused_in(field, unused))
 
 
 def _add_option(
@@ -130,7 +136,8 @@ def _add_option(
     parse, metavar = _value_parser(hint)
     how: dict[str, Any] = {"nargs": "?", "const": True} if bool in members_of(hint) else {}
     how |= {"dest": dest, "type": parse, "default": argparse.SUPPRESS}
-    text = f"{declared.help} [{_spell(getattr(options, field.name))}]".replace("None", "none")
+    about = declared.help.replace("None", "none")
+    text = f"{about} [{word_of(getattr(options, field.name))}]"
     action = group.add_argument(
         *(f"--{name}" for name in names), metavar=metavar, help=text.replace("%", "%%"), **how
     )
@@ -187,11 +194,3 @@ def _parse_bool(word: str) -> bool:
     if word.lower() not in values:
         raise argparse.ArgumentTypeError(f"'{word}' is neither 0 nor 1")
     return values[word.lower()]
-
-
-def _spell(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(int(value))
-    if isinstance(value, tuple):
-        return ",".join(map(str, value))
-    return str(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -189,8 +190,9 @@ class Colours:
 
 
 def mean_error(cloud: ModelPoints) -> float:
-    """Mean reprojection error in pixels of the points whose error is known."""
-    return float(cloud.error[cloud.error >= 0].mean())
+    """Mean reprojection error in pixels of the points whose error is known; NaN without any."""
+    known = cloud.error[cloud.error >= 0]
+    return float(known.mean()) if len(known) else math.nan
 
 
 def fitting_in_images(

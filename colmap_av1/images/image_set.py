@@ -63,6 +63,12 @@ class ImageSet:
             return None
         return 1.0 - sum(m.share if m is not None else 1.0 for m in self.masks) / len(self.masks)
 
+    @property
+    def photos(self) -> range:
+        """The images that are photos, which follow those of the videos."""
+        first = int(np.searchsorted(self.sequence, len(self.videos)))
+        return range(first, len(self.sequence))
+
     def images_of(self, sequence: int) -> range:
         """The images of a sequence."""
         first, last = np.searchsorted(self.sequence, [sequence, sequence + 1])

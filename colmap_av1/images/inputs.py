@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import ImageSet, count_through
 from colmap_av1.images.masks import Masks, VideoMasks, read_masks
+from colmap_av1.images.names import plain_name
 from colmap_av1.images.photos import Photo, photo_files, read_photos
 from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.options.images import LONGEST_NAME
@@ -217,7 +217,7 @@ def labels_of(places: Sequence[str]) -> list[str]:
     """
     if not places:
         return []
-    parts = [[_plain(part) for part in Path(place).parts[1:]] or ["root"] for place in places]
+    parts = [[plain_name(part) for part in Path(place).parts[1:]] or ["root"] for place in places]
     for count in range(1, max(map(len, parts)) + 1):
         labels = ["_".join(part[-count:]) for part in parts]
         # Some file systems ignore case.
@@ -226,11 +226,6 @@ def labels_of(places: Sequence[str]) -> list[str]:
     lower = [label.lower() for label in labels]
     twice = next(place for i, place in enumerate(places) if lower[i] in lower[:i])
     raise OptionError(f"{twice}: another video or folder has nearly this name: rename one")
-
-
-def _plain(word: str) -> str:
-    """Replace characters other than letters, digits, '-' and '_', which confuse some programs."""
-    return re.sub(r"[^\w-]+", "_", word)
 
 
 def _check_options(num_videos: int, photos: Path | None, options: MatchOptions) -> None:

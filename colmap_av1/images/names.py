@@ -116,6 +116,11 @@ def _guess_first_number(numbers: Sequence[int], num_frames: int, counts: str) ->
     )
 
 
+def plain_name(name: str) -> str:
+    """Replace characters other than letters, digits, '-' and '_', which confuse some programs."""
+    return re.sub(r"[^\w-]+", "_", name)
+
+
 def natural_order(names: Sequence[str]) -> list[int]:
     """Indices that sort names so that 'f9' comes before 'f10'."""
     return sorted(range(len(names)), key=lambda i: natural_key(names[i]))

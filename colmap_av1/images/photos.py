@@ -13,10 +13,10 @@ import pycolmap
 
 from colmap_av1.errors import ImageError, cannot_write
 from colmap_av1.images.files import READABLE, image_size, read_image
-from colmap_av1.images.names import image_file, natural_key
+from colmap_av1.images.names import image_file, natural_key, plain_name
 from colmap_av1.options.images import IMAGE_EXTENSIONS
 from colmap_av1.util.files import whole_file
-from colmap_av1.util.texts import check_name
+from colmap_av1.util.texts import check_name, some_names
 from colmap_av1.video.unchanged import FileState, file_state
 
 # Extensions of photos of phones and cameras that cannot be read. They cause a warning, unlike other
@@ -33,7 +33,6 @@ _UNREADABLE_PHOTOS = {
     ".arw",
     ".raf",
 }
-_NUM_NAMED = 3
 # Markers of JPEG (ITU-T T.81, table B.1). The end of the image does not occur within a scan.
 _START_OF_IMAGE, _END_OF_IMAGE, _START_OF_SCAN = b"\xff\xd8", b"\xff\xd9", b"\xda"
 _MARKER = re.compile(rb"\xff+([^\x00\xff])")
@@ -88,8 +87,7 @@ def photo_files(folder: Path) -> tuple[list[Path], str | None]:
             elif suffix in _UNREADABLE_PHOTOS:
                 unread.append(path)
     named = sorted((p.as_posix() for p in unread), key=natural_key)
-    some = ", ".join(named[:_NUM_NAMED]) + (", ..." if len(named) > _NUM_NAMED else "")
-    convert = f"convert these to JPEG or PNG: {some}"
+    convert = f"convert these to JPEG or PNG: {some_names(named)}"
     if not found:
         why = f"{convert}" if unread else "give a folder with JPEG or PNG files"
         raise ImageError(f"{folder}: holds no photo that can be read: {why}")
@@ -167,7 +165,7 @@ def _is_cut_short(path: Path) -> bool:
 def _flat(file: Path) -> str:
     """A photo's path in a form that trainers accept."""
     suffix = file.suffix.lower()
-    plain = [re.sub(r"[^\w-]+", "_", part) for part in file.with_suffix("").parts]
+    plain = [plain_name(part) for part in file.with_suffix("").parts]
     return "/".join(plain) + (suffix if suffix in IMAGE_EXTENSIONS else ".png")
 
 

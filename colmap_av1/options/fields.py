@@ -140,6 +140,18 @@ def declared_of(field: dataclasses.Field[Any]) -> Declared:
     return found
 
 
+def unused_in(field: dataclasses.Field[Any], unused: Collection[str]) -> frozenset[str]:
+    """The paths of the options that a part of other options lacks.
+
+    Args:
+        field: the field of the part.
+        unused: paths of the options that the other options lack, such as "match.images".
+    """
+    start = f"{field.name}."
+    below = {path.removeprefix(start) for path in unused if path.startswith(start)}
+    return declared_of(field).unused | below
+
+
 def field_types(kind: type) -> Mapping[str, Any]:
     """The types of a dataclass's fields, by name."""
     return _known_types(kind)

@@ -7,7 +7,7 @@ import os
 from collections.abc import Collection
 from typing import Any, cast
 
-from colmap_av1.options.fields import Options, declared_of, field_types, is_path, members_of
+from colmap_av1.options.fields import Options, field_types, is_path, members_of, unused_in
 
 
 def words_of(options: Options) -> list[str]:
@@ -25,22 +25,21 @@ def _words(options: Options, default: Options, unused: Collection[str]) -> list[
         if field.name in unused:
             continue
         if isinstance(value, Options):
-            start = f"{field.name}."
-            below = {path.removeprefix(start) for path in unused if path.startswith(start)}
-            words += _words(value, usual, below | declared_of(field).unused)
+            words += _words(value, usual, unused_in(field, unused))
         elif value != usual:
             hint = field_types(type(options))[field.name]
-            words.append(f"--{field.name}={_spell(value, hint)}")
+            if value is not None and is_path(members_of(hint)):
+                value = os.path.abspath(value)
+            words.append(f"--{field.name}={word_of(value)}")
     return words
 
 
-def _spell(value: object, hint: object) -> str:
+def word_of(value: object) -> str:
+    """The value of an option as it is written on a command line."""
     if value is None:
         return "none"
     if isinstance(value, bool):
         return str(int(value))
     if isinstance(value, tuple):
         return ",".join(map(str, value))
-    if is_path(members_of(hint)):
-        return os.path.abspath(cast("str | os.PathLike[str]", value))
     return str(value)

@@ -138,7 +138,7 @@ def adjustment_stage(
             run.progress("adjustment", 1, 1)
             registered = without_unseen_images(adjusted.model)
         names = image_set.images.names
-        photos = names[image_set.images_of(len(image_set.videos)).start :]
+        photos = names[image_set.photos.start :]
         seams = model_seams(registered.model, photos, names)
         with run.clock.measure("adjustment"):
             own = with_own_cameras(run, registered.model)

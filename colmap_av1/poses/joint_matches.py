@@ -421,8 +421,7 @@ def _warnings(
             f"are matched without known poses: {some_names(matched)}"
         )
     if alone:
-        is_video = image_set.sequence < len(image_set.videos)
-        have_motion = {image_set.images.names[i] for i in np.flatnonzero(is_video)}
+        have_motion = set(image_set.images.names[: image_set.photos.start])
         advice = "; --verify pairs matches them by motion alone, which may bend models"
         warnings.append(
             f"{len(alone)} of {num_images} images are not registered in the joint estimate and "

@@ -127,7 +127,7 @@ def match_stage(
                 places=run.positions.places[index] if run.positions is not None else None,
             )
         _write_links(partial / run.stages.name, found)
-        of_videos = cameras[: keyed.images_of(len(videos)).start]
+        of_videos = cameras[: keyed.photos.start]
         configs = [geometry.config for geometry in matched.geometries]
         num_keypoints = sum(len(k.xy) for k in matched.keypoints)
         return MatchesResult(
@@ -168,7 +168,7 @@ def _key_images(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) ->
         tracks = pose_tracks(run, own.tracks).keep_frames(frames)
         found = key_images_of_video(run, tracks, own.chosen, own.inter_share, own.fast)
         index += (found + image_set.images_of(video).start).tolist()
-    return index + list(range(image_set.images_of(len(videos)).start, len(image_set.sequence)))
+    return [*index, *image_set.photos]
 
 
 def _pose_density(run: Run) -> DensityOptions:
@@ -230,5 +230,5 @@ def _match_images(
         options=options,
         context=context,
         name=run.inputs.name,
-        images_apart=image_set.images_of(len(videos)).start / keyed.images_of(len(videos)).start,
+        images_apart=image_set.photos.start / keyed.photos.start,
     )

@@ -191,7 +191,7 @@ def measure_case(
                     where = folder / f"{name}-all-tracks"
                     made = densify_model(mapper.model, footage, where, ALL_TRACKS[name])
                     assert made.model is not None
-                    dense = made, model_figures(made.model)
+                    dense = made, model_figures(read_model(made.model))
         except ColmapAv1Error as error:
             console.print(f"error: {case.name}: {name}: {error}", markup=False)
             continue

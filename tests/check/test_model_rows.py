@@ -25,7 +25,6 @@ def check(shortest: float, longest: float, expected_error: float | None = None) 
         coverage=0.9,
         mean_error=0.5,
         median_error=0.4,
-        focal_length=(shortest + longest) / 2,
         focal_lengths=(shortest, longest),
     )
     return ModelCheck(figures, Seams((), NONE, NONE, NONE, NONE), expected_error, None, None)

@@ -208,10 +208,10 @@ def test_databases_of_frontends_can_be_mapped(name, scene_footage, tmp_path):
     arguments = (run.database, scene_footage.image_path, tmp_path / "model", settings)
     mapper = measure_mapper(*arguments)
     assert measure_mapper(*arguments) == mapper
-    figures = model_figures(mapper.model)
+    figures = model_figures(pycolmap.Reconstruction(mapper.model))
     assert figures.num_registered == 8
     assert figures.num_points > 1000
-    assert figures.focal_length == 390
+    assert figures.focal_lengths == (390, 390)
     assert 0 < figures.median_error < figures.mean_error < 1
     model = pycolmap.Reconstruction(mapper.model)
     assert figures.mean_error == pytest.approx(model.compute_mean_reprojection_error())

@@ -219,7 +219,7 @@ def supported_links(
     position = {
         image: k + _VIDEO_OFFSET * int(image_set.sequence[image]) for k, image in enumerate(images)
     }
-    photos = set(range(image_set.images_of(len(image_set.videos)).start, len(image_set.sequence)))
+    photos = set(image_set.photos)
     pairs = [(i, j) for i, j in links.pairs.tolist()]
     sure = {
         (i, j)

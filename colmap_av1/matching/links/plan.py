@@ -153,7 +153,7 @@ def plan_links(
     between: list[int] = []
     if image_set.num_sequences > 1:
         between = spread_over_videos(image_set, matched, images_apart)
-        between += range(image_set.images_of(len(image_set.videos)).start, len(image_set.sequence))
+        between += image_set.photos
     return Plan(
         chosen,
         around,
