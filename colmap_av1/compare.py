@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,7 +31,7 @@ from colmap_av1.tracks.video_tracks import with_stream_kept
 from colmap_av1.util.arrays import Floats
 from colmap_av1.util.files import check_apart
 from colmap_av1.util.progress import Progress, no_progress
-from colmap_av1.util.stages import open_stages
+from colmap_av1.util.stages import open_stages, writing_stages
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.metadata.spherical import check_is_plane
 
@@ -119,7 +118,7 @@ def compare(
     _check_reference(output, reference)
     video = read_video(video, options.match.read.operating_point)
     check_is_plane(video.path, video.projection, video.picture_size[0])
-    with open_stages(output, "compare"), _writing(output):
+    with open_stages(output, "compare"), writing_stages(output):
         footage = choose_footage(
             video,
             output / "footage",
@@ -167,19 +166,6 @@ def compare(
         clouds = {column.name: cloud for column, cloud in measured if cloud is not None}
         write_report(report, clouds, footage)
     return report
-
-
-@contextmanager
-def _writing(output: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if error.filename is not None and output not in Path(error.filename).parents:
-            raise  # An input cannot be read.
-        raise OptionError(
-            f"{output}: cannot be written: {error.strerror or error}: fix that and run the same "
-            "command again, finished stages are kept"
-        ) from error
 
 
 def _check_reference(output: Path, reference: str | os.PathLike[str] | None) -> None:

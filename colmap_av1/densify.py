@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_av1.errors import ModelError, WriteError, cannot_write
+from colmap_av1.errors import ModelError, writing
 from colmap_av1.geometry.colmap_model import (
     MODEL_FILES,
     ModelImage,
@@ -315,11 +315,8 @@ def _write(
     points: ModelPoints,
     overwrite: bool,
 ) -> None:
-    try:
-        with whole_folder(output, MODEL_FILES if overwrite else None) as partial:
-            write_model(partial, cameras, images, points)
-    except OSError as error:
-        raise WriteError(cannot_write(output, error)) from error
+    with writing(output), whole_folder(output, MODEL_FILES if overwrite else None) as partial:
+        write_model(partial, cameras, images, points)
 
 
 def _write_gaussians(

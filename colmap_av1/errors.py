@@ -6,6 +6,8 @@ Any other exception is a defect of this package.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -42,7 +44,7 @@ class HlocError(ColmapAv1Error):
 
 
 class EncodeError(ColmapAv1Error):
-    """No AV1 encoder works, it fails, or the stream cannot be written."""
+    """No AV1 encoder works, or it fails."""
 
 
 class ModelError(ColmapAv1Error):
@@ -50,7 +52,7 @@ class ModelError(ColmapAv1Error):
 
 
 class WriteError(ColmapAv1Error):
-    """A file of a run or a model cannot be written, for example because the disk is full."""
+    """An output cannot be written, for example because the disk is full."""
 
 
 class OptionError(ColmapAv1Error):
@@ -65,3 +67,16 @@ def cannot_write(path: Path, error: Exception) -> str:
     """Message for a file or folder that the system refuses to write."""
     reason = getattr(error, "strerror", None) or error
     return f"{path}: cannot be written: {reason}: fix that, or give another path"
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Raise `WriteError` if the system refuses to write a file or folder.
+
+    Args:
+        path: what is written within the context, for the message.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise WriteError(cannot_write(path, error)) from error

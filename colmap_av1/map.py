@@ -20,8 +20,7 @@ from colmap_av1.errors import (
     ImageError,
     ModelError,
     OptionError,
-    WriteError,
-    cannot_write,
+    writing,
 )
 from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
@@ -135,28 +134,25 @@ def map_database(
     checked = _check_input(database, image_path, place)
 
     own = MODEL_FILES if overwrite else None
-    try:
-        with _log() as log, whole_folder(output, own) as partial:
-            with clock.measure("poses"):
-                num_registered, forward = _map(
-                    checked, image_path, partial, options, log=log, progress=progress
+    with writing(output), _log() as log, whole_folder(output, own) as partial:
+        with clock.measure("poses"):
+            num_registered, forward = _map(
+                checked, image_path, partial, options, log=log, progress=progress
+            )
+        if not num_registered:
+            raise ModelError(
+                f"{database}: COLMAP's {options.mapper} mapper finds no model, its images "
+                "share too few matches or have too little parallax: see 'colmap-av1 check' and "
+                f"{log}, try the other --mapper, or give --camera_params when matching"
+            )
+        with clock.measure("place"):
+            try:
+                placement = _place(partial, database, image_path, place, options.seed)
+            except (ImageError, OptionError) as error:  # The model is valid without a place.
+                placement = Placement(
+                    warnings=(f"the model keeps the mapper's coordinates: {error}",)
                 )
-            if not num_registered:
-                raise ModelError(
-                    f"{database}: COLMAP's {options.mapper} mapper finds no model, its images "
-                    "share too few matches or have too little parallax: see 'colmap-av1 check' and "
-                    f"{log}, try the other --mapper, or give --camera_params when matching"
-                )
-            with clock.measure("place"):
-                try:
-                    placement = _place(partial, database, image_path, place, options.seed)
-                except (ImageError, OptionError) as error:  # The model is valid without a place.
-                    placement = Placement(
-                        warnings=(f"the model keeps the mapper's coordinates: {error}",)
-                    )
-                write_place(partial, placement)
-    except OSError as error:
-        raise WriteError(cannot_write(output, error)) from error
+            write_place(partial, placement)
     model = read_model(output / "0")
     unreadable = None
     with clock.measure("long range"):

@@ -13,7 +13,7 @@ from pathlib import Path
 import cattrs
 import numpy as np
 
-from colmap_av1.errors import ColmapAv1Error, ModelError, WriteError, cannot_write
+from colmap_av1.errors import ColmapAv1Error, ModelError, writing
 from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.geometry.track_points import LEAST_AGREEING
@@ -433,8 +433,5 @@ def read_report(output: str | os.PathLike[str]) -> ReconstructReport:
 def _write_report(report: ReconstructReport) -> None:
     text = json.dumps(dataclasses.asdict(report), indent=1, default=str)
     path = report.output / REPORT
-    try:
-        with whole_file(path) as partial:
-            partial.write_text(text + "\n")
-    except OSError as error:
-        raise WriteError(cannot_write(path, error)) from error
+    with writing(path), whole_file(path) as partial:
+        partial.write_text(text + "\n")

@@ -18,7 +18,14 @@ from conftest import SHARED, Encode
 
 from colmap_av1 import view
 from colmap_av1.cli import main
-from colmap_av1.errors import ColmapAv1Error, LimitError, ModelError, OptionError, VideoError
+from colmap_av1.errors import (
+    ColmapAv1Error,
+    LimitError,
+    ModelError,
+    OptionError,
+    VideoError,
+    WriteError,
+)
 from colmap_av1.match import match
 from colmap_av1.motion.info import read_info
 from colmap_av1.options import DensityOptions, MatchOptions, TrackOptions, ViewOptions
@@ -120,13 +127,13 @@ def test_odd_sizes_are_padded(encode: Encode, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("output", "message"),
-    [("x.gif", r"\.mp4"), ("missing/x.mp4", "missing")],
+    ("output", "message", "error"),
+    [("x.gif", r"\.mp4", OptionError), ("missing/x.mp4", "missing", WriteError)],
 )
 def test_invalid_outputs_are_refused_and_leave_nothing(
-    panning: Path, tmp_path: Path, output: str, message: str
+    panning: Path, tmp_path: Path, output: str, message: str, error: type[ColmapAv1Error]
 ) -> None:
-    with pytest.raises(OptionError, match=message):
+    with pytest.raises(error, match=message):
         view.view_video(panning, tmp_path / output)
     assert list(tmp_path.iterdir()) == []
 

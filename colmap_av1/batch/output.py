@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_av1.batch.rows import json_text
-from colmap_av1.errors import OptionError, cannot_write
+from colmap_av1.errors import OptionError, writing
 from colmap_av1.util.files import REPORT, only_run, remove_leftovers, whole_file
 from colmap_av1.util.remote import filesystem, is_url
 
@@ -77,15 +77,14 @@ class Output:
         """Create the output if it is missing, and lock a shard of the videos.
 
         Raises:
-            OptionError: the output cannot be created, another batch has locked the shard, or one
-                with another number of shards, which has some of the same videos, is at work.
+            OptionError: another batch has locked the shard, or one with another number of shards,
+                which has some of the same videos, is at work.
+            WriteError: the output cannot be created.
         """
         lock = self._root / HIDDEN / f"{ROWS}{shard}.lock"
-        try:
+        with writing(self._root):
             lock.parent.mkdir(parents=True, exist_ok=True)
             lock.touch()
-        except OSError as error:
-            raise OptionError(cannot_write(self._root, error)) from error
         others = [lock.parent / name for name in self._other_locks(lock)]
         with only_run(lock) as alone, ExitStack() as opened:
             if not alone or not all([opened.enter_context(only_run(other)) for other in others]):

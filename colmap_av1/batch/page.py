@@ -16,7 +16,7 @@ from colmap_av1.batch.output import PAGE, ROWS, Output, output_at
 from colmap_av1.batch.rows import Row, row_of
 from colmap_av1.batch.run import batch_files
 from colmap_av1.batch.video import THUMBNAIL
-from colmap_av1.errors import OptionError, cannot_write
+from colmap_av1.errors import OptionError, writing
 from colmap_av1.util.pages import render_page
 from colmap_av1.util.remote import absolute, without_secrets
 
@@ -64,8 +64,8 @@ def write_page(output: str | os.PathLike[str], *, most_rows: int = MOST_ROWS) ->
         The page's path or URL.
 
     Raises:
-        OptionError: the output has no batch, a file of the batch is damaged, or the page cannot be
-            written.
+        OptionError: the output has no batch, or a file of the batch is damaged.
+        WriteError: the page cannot be written.
 
     Examples:
         >>> from colmap_av1 import write_page
@@ -102,10 +102,8 @@ def write_page(output: str | os.PathLike[str], *, most_rows: int = MOST_ROWS) ->
             (row, _thumbnail(row, into), [_cell(row, name) for name in columns]) for row in shown
         ],
     )
-    try:
+    with writing(Path(f"{shown_place}/{PAGE}")):
         into.write(PAGE, text.encode("utf-8", "replace"))
-    except OSError as error:
-        raise OptionError(cannot_write(Path(f"{shown_place}/{PAGE}"), error)) from error
     return f"{shown_place}/{PAGE}"
 
 

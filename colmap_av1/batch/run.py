@@ -20,7 +20,7 @@ from colmap_av1.batch.inputs import Video, list_videos
 from colmap_av1.batch.output import ROWS, Output, output_at, scratch_for
 from colmap_av1.batch.rows import Row, csv_of, json_of, row_of
 from colmap_av1.batch.video import SCRATCH, Outcome, Work, failed_row
-from colmap_av1.errors import OptionError, cannot_write
+from colmap_av1.errors import OptionError, WriteError, cannot_write, writing
 from colmap_av1.options import BatchOptions, DensifyOptions, MatchOptions
 from colmap_av1.options.batch import TASK_OPTIONS
 from colmap_av1.options.fields import Options
@@ -118,7 +118,8 @@ def run_batch(
         on_progress: called at the start, and with the row of each video when it has ended.
 
     Raises:
-        OptionError: the inputs or options are invalid, or the output cannot be written.
+        OptionError: the inputs or options are invalid.
+        WriteError: the output cannot be written.
         OSError: the inputs cannot be read.
 
     Examples:
@@ -252,12 +253,10 @@ def _check_scratch(scratch: str) -> None:
     """Create the folder for unfinished work, and remove leftovers of killed processes.
 
     Raises:
-        OptionError: it cannot be created.
+        WriteError: it cannot be created.
     """
-    try:
+    with writing(Path(scratch)):
         os.makedirs(scratch, exist_ok=True)
-    except OSError as error:
-        raise OptionError(cannot_write(Path(scratch), error)) from error
     remove_leftovers(Path(scratch), SCRATCH)
 
 
@@ -304,7 +303,7 @@ def _write_rows(
         earlier: rows of an earlier run, which remain until this run has its own.
 
     Raises:
-        OptionError: they cannot be written.
+        WriteError: they cannot be written.
     """
     left = {i: row for i, row in earlier.items() if i not in rows}
     ordered = [row for _, row in sorted({**left, **rows}.items())]
@@ -316,7 +315,7 @@ def _write_rows(
         output.write(f"{name}.json", json_of(own, facts))
     except OSError as error:
         path = Path(os.fsdecode(error.filename or f"{name}.csv"))
-        raise OptionError(cannot_write(path, error)) from error
+        raise WriteError(cannot_write(path, error)) from error
 
 
 def _earlier_rows(output: Output, shard: str, videos: Sequence[Video]) -> dict[int, Row]:

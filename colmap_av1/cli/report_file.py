@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_av1.cli.terminal import renamed
-from colmap_av1.errors import OptionError, cannot_write
+from colmap_av1.errors import OptionError, writing
 from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.files import check_creatable, whole_file
 from colmap_av1.util.plain import plain
@@ -85,9 +85,7 @@ def _check_report(path: Path, outputs: Iterable[str | None]) -> None:
 
 
 def _write(path: str, facts: dict[str, Any]) -> None:
-    try:
+    with writing(Path(path)):
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         with whole_file(Path(path)) as partial:
             partial.write_text(json.dumps(plain(facts, renamed), indent=1, allow_nan=False) + "\n")
-    except OSError as error:
-        raise OptionError(cannot_write(Path(path), error)) from error

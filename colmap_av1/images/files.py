@@ -17,7 +17,7 @@ import av.error
 import cv2
 import numpy as np
 
-from colmap_av1.errors import ImageError, VideoError, cannot_write
+from colmap_av1.errors import ImageError, VideoError, writing
 from colmap_av1.images.names import (
     WRITE_PARAMETERS,
     image_file,
@@ -166,13 +166,11 @@ def alone_in(folder: Path) -> Iterator[None]:
     On Windows, and on file systems without locks, the folder is not locked.
 
     Raises:
-        ImageError: the folder cannot be created.
+        WriteError: the folder cannot be created.
     """
     is_new = not folder.exists()
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ImageError(cannot_write(folder, error)) from error
     with contextlib.ExitStack() as ending:
         if fcntl is not None:
             held = os.open(folder, os.O_RDONLY)
@@ -231,8 +229,8 @@ def write_images(
         The number of images written; the others existed.
 
     Raises:
-        ImageError: an image cannot be written, the frames change their size, or the decoder
-            returns too few frames.
+        ImageError: the frames change their size, or the decoder returns too few frames.
+        WriteError: an image cannot be written.
         BitstreamError: the stream cannot be decoded up to the last frame.
         VideoError: the video cannot be read, or changes meanwhile; images written from it are then
             removed.
@@ -432,14 +430,11 @@ def write_image(path: Path, image: Picture) -> None:
     """Write an image (BGR), PNG or JPEG by its extension; it appears when it is complete.
 
     Raises:
-        ImageError: the file cannot be written.
+        WriteError: the file cannot be written.
         OptionError: the extension is that of another format.
     """
     check_extension(path.name)
     suffix = path.suffix.lower()
     encoded = cv2.imencode(suffix, image, WRITE_PARAMETERS[suffix])[1].tobytes()
-    try:
-        with whole_file(path) as partial:
-            partial.write_bytes(encoded)
-    except OSError as error:
-        raise ImageError(cannot_write(path, error)) from error
+    with writing(path), whole_file(path) as partial:
+        partial.write_bytes(encoded)

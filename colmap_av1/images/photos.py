@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 import pycolmap
 
-from colmap_av1.errors import ImageError, cannot_write
+from colmap_av1.errors import ImageError, writing
 from colmap_av1.images.files import READABLE, image_size, read_image
 from colmap_av1.images.names import image_file, natural_key, plain_name
 from colmap_av1.options.images import IMAGE_EXTENSIONS
@@ -176,7 +176,8 @@ def place_photos(photos: Sequence[Photo], folder: Path) -> int:
         The number of photos copied.
 
     Raises:
-        ImageError: another file has the name of a photo, or a photo cannot be copied.
+        ImageError: another file has the name of a photo.
+        WriteError: a photo cannot be copied.
     """
     num_copied = 0
     for photo in photos:
@@ -184,12 +185,10 @@ def place_photos(photos: Sequence[Photo], folder: Path) -> int:
         if file.exists():
             _check_same(photo, file)
             continue
-        try:
+        with writing(file):
             file.parent.mkdir(parents=True, exist_ok=True)
             with whole_file(file) as partial:
                 shutil.copyfile(photo.path, partial)
-        except OSError as error:
-            raise ImageError(cannot_write(file, error)) from error
         num_copied += 1
     return num_copied
 

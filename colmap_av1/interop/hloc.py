@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_row, matches_from_row
-from colmap_av1.errors import DatabaseError, HlocError, OptionError, cannot_write
+from colmap_av1.errors import DatabaseError, HlocError, writing
 from colmap_av1.options import ExportOptions
 from colmap_av1.util.arrays import Ints
 from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
@@ -93,7 +93,8 @@ def export_hloc(
     Raises:
         DatabaseError: the file is missing, unreadable, not a COLMAP database, has no keypoints, or
             holds something that hloc's layout cannot represent.
-        OptionError: the folder cannot be written, or a file exists and `overwrite` is not set.
+        OptionError: a file exists and `overwrite` is not set.
+        WriteError: the folder cannot be written.
 
     Examples:
         >>> from colmap_av1 import export_hloc
@@ -147,10 +148,10 @@ def _complete_files(folder: Path) -> Iterator[tuple[_Write, _Write, Any]]:
     names = (FEATURES, MATCHES, PAIRS)
     complete = False
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in names:
-            remove_leftovers(folder, name)
-        with contextlib.ExitStack() as files:
+        with writing(folder), contextlib.ExitStack() as files:
+            folder.mkdir(parents=True, exist_ok=True)
+            for name in names:
+                remove_leftovers(folder, name)
             partial = [files.enter_context(whole_file(folder / name)) for name in names]
             with (
                 new_hdf5(partial[0]) as features,
@@ -159,8 +160,6 @@ def _complete_files(folder: Path) -> Iterator[tuple[_Write, _Write, Any]]:
             ):
                 yield features, matches, pairs
         complete = True
-    except OSError as error:
-        raise OptionError(cannot_write(folder, error)) from error
     finally:
         if not complete:
             with contextlib.suppress(OSError):

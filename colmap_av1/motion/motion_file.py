@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import OptionError, VideoError, cannot_write
+from colmap_av1.errors import OptionError, VideoError, writing
 from colmap_av1.motion.frame_motion import UNIT_FIELDS, FrameMotion
 from colmap_av1.motion.reading import read_motion
 from colmap_av1.options import ReadOptions
@@ -51,7 +51,8 @@ def export_motion(
         The number of coded frames.
 
     Raises:
-        OptionError: the extension is unknown, the file exists, or it cannot be written.
+        OptionError: the extension is unknown, or the file exists.
+        WriteError: the file cannot be written.
         VideoError: the video cannot be read or has no frames.
         BitstreamError: the stream is damaged and `options.strict` is set.
 
@@ -70,7 +71,7 @@ def export_motion(
         raise OptionError(f"{path}: give an output file that ends in .npz or .h5")
     check_new_file(path, [video], overwrite=overwrite)
     count = 0
-    try:
+    with writing(path):
         remove_leftovers(path.parent, path.name)
         with whole_file(path) as partial:
             with writers[path.suffix.lower()](partial) as write:
@@ -81,8 +82,6 @@ def export_motion(
                     progress("motion", count, None)
             if count == 0:
                 raise VideoError(f"{video}: has no frames: give another video")
-    except OSError as error:
-        raise OptionError(cannot_write(path, error)) from error
     return count
 
 

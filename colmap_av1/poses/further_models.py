@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_av1.errors import ModelError, WriteError, cannot_write
+from colmap_av1.errors import ModelError, writing
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.estimate import (
@@ -170,10 +170,8 @@ def _run_of_model(run: Run, number: int) -> Run:
     """The run of a further model, with a separate output folder."""
     output = run.output / f"{_FOLDER}{number}"
     own = replace(run, output=output, stages=output / run.stages.name)
-    try:
+    with writing(output):
         own.stages.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WriteError(cannot_write(output, error)) from error
     for folder in (own.output, own.stages):
         remove_leftovers(folder)
     return own

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import OptionError, WriteError, cannot_write
+from colmap_av1.errors import OptionError, writing
 from colmap_av1.geometry.colmap_model import camera_centres, model_points, posed_images, read_model
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.distant_points import distance_uncertainty
@@ -199,14 +199,12 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
     header = ["ply", "format binary_little_endian 1.0", _MADE_BY]
     header += [f"element vertex {len(gaussians.xyz)}"]
     header += [*(f"property float {name}" for name in names), "end_header"]
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(path) as partial, partial.open("wb") as file:
             file.write(("\n".join(header) + "\n").encode())
             for first in range(0, len(gaussians.xyz), _CHUNK):
                 file.write(_records(gaussians, slice(first, first + _CHUNK)).tobytes())
-    except OSError as error:
-        raise WriteError(cannot_write(path, error)) from error
 
 
 def remove_gaussians_in(folder: Path) -> None:
@@ -216,10 +214,8 @@ def remove_gaussians_in(folder: Path) -> None:
         WriteError: a file cannot be removed.
     """
     for path in filter(_is_own, sorted(folder.glob("*.ply"))):
-        try:
+        with writing(path):
             path.unlink()
-        except OSError as error:
-            raise WriteError(cannot_write(path, error)) from error
 
 
 def _is_own(path: Path) -> bool:

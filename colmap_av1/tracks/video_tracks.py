@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import (
     BitstreamError,
-    EncodeError,
     ImageError,
     VideoError,
+    WriteError,
     cannot_write,
 )
 from colmap_av1.motion.frame_motion import FrameMotion
@@ -131,7 +131,8 @@ def open_source(
 
     Raises:
         VideoError: the video cannot be converted.
-        EncodeError: no AV1 encoder works, or the stream cannot be written.
+        EncodeError: no AV1 encoder works.
+        WriteError: the stream cannot be written.
         OptionError: `keep_stream` names an existing file that is not a kept stream.
     """
     # A killed run may have left its stream here, even if this video needs no conversion.
@@ -212,7 +213,7 @@ def _scratch(next_to: Path) -> Iterator[Path]:
             folder = made.enter_context(scratch_folder(next_to))
         except OSError as error:
             where = next_to.absolute().parent
-            raise EncodeError(f"{cannot_write(where, error)}; or give --keep_stream") from error
+            raise WriteError(f"{cannot_write(where, error)}; or give --keep_stream") from error
         yield folder
 
 

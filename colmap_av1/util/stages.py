@@ -22,7 +22,7 @@ from typing import Any, Generic, TypeVar
 
 import cattrs
 
-from colmap_av1.errors import OptionError, WriteError, cannot_write
+from colmap_av1.errors import OptionError, WriteError, writing
 from colmap_av1.util.digests import (
     code_digest,
     digest_of,
@@ -65,12 +65,12 @@ def open_stages(output: Path, command: str) -> Iterator[Path]:
         command: the command that writes the output.
 
     Raises:
-        OptionError: the output folder contains something else, cannot be created, or another run
-            is writing to it.
+        OptionError: the output folder contains something else, or another run is writing to it.
+        WriteError: it cannot be created.
     """
     stages = output / _FOLDER
     with ExitStack() as running:
-        try:
+        with writing(output):
             if output.exists() and not output.is_dir():
                 raise OptionError(f"{output}: is a file: give a folder")
             if output.is_dir() and not stages.is_dir() and any(output.iterdir()):
@@ -86,8 +86,6 @@ def open_stages(output: Path, command: str) -> Iterator[Path]:
             if other is not None:
                 raise OptionError(f"{output}: is the output of {other}: give another folder")
             alone = running.enter_context(only_run(lock))
-        except OSError as error:
-            raise OptionError(cannot_write(output, error)) from error
         if not alone:
             raise OptionError(
                 f"{output}: another run is writing to it: wait for its end, or give another folder"
@@ -95,6 +93,24 @@ def open_stages(output: Path, command: str) -> Iterator[Path]:
         for folder in (output, stages):
             remove_leftovers(folder)
         yield stages
+
+
+@contextmanager
+def writing_stages(output: Path) -> Iterator[None]:
+    """Raise `WriteError` if a file in an output cannot be written. Errors of inputs pass.
+
+    Args:
+        output: the output of a command that resumes.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None and output not in Path(error.filename).parents:
+            raise  # An input cannot be read.
+        raise WriteError(
+            f"{output}: cannot be written: {error.strerror or error}: fix that and run the same "
+            "command again, finished stages are kept"
+        ) from error
 
 
 def run_stage(
@@ -135,19 +151,13 @@ def run_stage(
         return finished
     partial = stages / f"{name}.partial"
     try:
-        _remove(partial)
-        partial.mkdir()
-        give_back_free_memory()  # memory that earlier stages have freed
-        result = make(partial)
-        made = _put_in_place(record, partial, into, products)
-        return _record(record, key, result, kind, into=into, products=made)
-    except OSError as error:
-        if error.filename is not None and stages.parent not in Path(error.filename).parents:
-            raise  # an input could not be read
-        raise WriteError(
-            f"{into}: cannot be written: {error.strerror or error}: fix that and run the same "
-            "command again, finished stages are kept"
-        ) from error
+        with writing_stages(stages.parent):
+            _remove(partial)
+            partial.mkdir()
+            give_back_free_memory()  # memory that earlier stages have freed
+            result = make(partial)
+            made = _put_in_place(record, partial, into, products)
+            return _record(record, key, result, kind, into=into, products=made)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

@@ -22,7 +22,7 @@ from colmap_av1.errors import (
     NotAv1Error,
     OptionError,
     VideoError,
-    cannot_write,
+    writing,
 )
 from colmap_av1.options import EncodeOptions
 from colmap_av1.util.files import check_new_file, may_read, remove_leftovers, whole_file
@@ -106,7 +106,8 @@ def encode(
     Raises:
         VideoError: the video is missing or cannot be decoded.
         BitstreamError: the video is damaged and `strict` is set.
-        EncodeError: no encoder works, or the output cannot be written.
+        EncodeError: no encoder works.
+        WriteError: the output cannot be written.
         OptionError: an option has an invalid value, or the output exists.
 
     Examples:
@@ -200,14 +201,11 @@ def _encode(
         _check_stream(path, partial, count)
         return count
 
-    try:
-        with whole_file(target) as partial, unchanged(file.state):
-            count = convert(partial)
-            readable = _readable_frames(file, count, damage, strict=strict)
-            if readable < count:
-                count = convert(partial, readable)
-    except OSError as error:
-        raise EncodeError(cannot_write(output, error)) from error
+    with writing(output), whole_file(target) as partial, unchanged(file.state):
+        count = convert(partial)
+        readable = _readable_frames(file, count, damage, strict=strict)
+        if readable < count:
+            count = convert(partial, readable)
     loss = loss_of(file, positions, output)
     if loss is not None:
         warnings.warn(loss, stacklevel=3)
@@ -238,7 +236,8 @@ def stream_of(
     Raises:
         VideoError: the video is missing or cannot be decoded.
         BitstreamError: the video is damaged and `strict` is set.
-        EncodeError: no encoder works, or the stream cannot be written.
+        EncodeError: no encoder works.
+        WriteError: the stream cannot be written.
         OptionError: an option has an invalid value, or `keep_stream` names an existing file
             that is not a kept stream.
     """

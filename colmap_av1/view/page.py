@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import OptionError, cannot_write
+from colmap_av1.errors import OptionError, writing
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.geometry.coverage import PosedCamera, coverage
 from colmap_av1.images.files import read_image
@@ -136,7 +136,8 @@ def write_model_page(
         overwrite: replace an existing page.
 
     Raises:
-        OptionError: see `check_page`; or the file cannot be written.
+        OptionError: see `check_page`.
+        WriteError: the file cannot be written.
         ModelError: the folder has no model, or a model without poses.
         ImageError: an image is missing or unreadable.
     """
@@ -170,11 +171,8 @@ def write_model_page(
         version=package_version(),
     )
     path = Path(output)
-    try:
-        with whole_file(path) as partial:
-            partial.write_text(text, encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise OptionError(cannot_write(path, error)) from error
+    with writing(path), whole_file(path) as partial:
+        partial.write_text(text, encoding="utf-8", errors="replace")
 
 
 def _plotly() -> Any:

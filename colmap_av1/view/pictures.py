@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import OptionError, cannot_write
+from colmap_av1.errors import OptionError, WriteError, cannot_write, writing
 from colmap_av1.util.arrays import Picture
 from colmap_av1.util.files import check_new_file, remove_leftovers, whole_file
 from colmap_av1.util.memory import check_memory
@@ -55,7 +55,8 @@ def write_picture(
     """Write a picture as PNG or JPEG, depending on the extension.
 
     Raises:
-        OptionError: see `check_picture`; or the file cannot be written.
+        OptionError: see `check_picture`.
+        WriteError: the file cannot be written.
     """
     check_picture(output, overwrite=overwrite)
     _write_picture(picture, Path(output))
@@ -104,12 +105,8 @@ def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Picture],
             _write_picture(picture, path / f"frame_{count:06d}.png")
             count += 1
 
-        try:
+        with writing(path):
             path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OptionError(
-                f"{path}: cannot be created: {error.strerror}: fix that, or give another path"
-            ) from error
         yield write_file
         return
     with _output(path) as partial, av.open(str(partial), "w", "mp4") as container:
@@ -142,11 +139,11 @@ def open_pictures(path: Path, frame_rate: float) -> Iterator[Callable[[Picture],
 
 @contextmanager
 def _output(path: Path) -> Iterator[Path]:
-    """A `whole_file` whose errors become an OptionError."""
+    """A `whole_file` whose errors become a WriteError."""
     try:
         remove_leftovers(path.parent, path.name)
         with whole_file(path) as partial:
             yield partial
     except (OSError, av.error.FFmpegError) as error:
         check_memory(error)
-        raise OptionError(cannot_write(path, error)) from error
+        raise WriteError(cannot_write(path, error)) from error

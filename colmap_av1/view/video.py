@@ -78,7 +78,8 @@ def view_video(
         The number of frames drawn.
 
     Raises:
-        OptionError: the output cannot be written, or exists and `overwrite` is not set.
+        OptionError: the output exists and `overwrite` is not set.
+        WriteError: it cannot be written.
         VideoError: the file cannot be read as a video, is not AV1, or changes meanwhile.
         BitstreamError: the stream is damaged, and `strict` is set or fewer than two frames precede
             the damage.

@@ -30,7 +30,7 @@ from colmap_av1 import (
 )
 from colmap_av1.batch.run import Counts
 from colmap_av1.cli import main
-from colmap_av1.errors import ColmapAv1Error
+from colmap_av1.errors import ColmapAv1Error, WriteError
 
 ONCE = BatchOptions(retries=0)
 SMALL = MatchOptions(
@@ -236,7 +236,7 @@ def test_folder_that_cannot_be_created_fails_only_its_video(clips: Path, tmp_pat
     (out / "a").write_text("a file")
     report = run_batch(videos, out, ReadOptions(), options=ONCE)
     assert (report.num_done, report.failed) == (1, {"reading or writing": 1})
-    with pytest.raises(OptionError, match="cannot be written"):
+    with pytest.raises(WriteError, match="written"):
         run_batch(videos, out / "a", ReadOptions())
 
 

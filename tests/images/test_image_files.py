@@ -15,7 +15,7 @@ import pytest
 from conftest import Encode, encode_two_sizes
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.errors import ImageError, OptionError, WriteError
 from colmap_av1.images.files import (
     check_image_folder,
     image_size,
@@ -307,7 +307,7 @@ def no_space() -> Iterator[None]:
 
 def test_full_disk_leaves_no_partial_image(clip: Path, tmp_path: Path) -> None:
     # Only around the call, because the output of the test may also go to a file.
-    with no_space(), pytest.raises(ImageError, match=r"a\.png"):
+    with no_space(), pytest.raises(WriteError, match=r"a\.png"):
         write_images(clip, tmp_path, ["a.png"], [0])
     assert list(tmp_path.iterdir()) == []
 

@@ -15,7 +15,7 @@ from synthetic_scene import HEIGHT, WIDTH
 from colmap_av1.cli import main
 from colmap_av1.database.reading import read_images
 from colmap_av1.database.writing import write_matches
-from colmap_av1.errors import DatabaseError, HlocError, OptionError
+from colmap_av1.errors import DatabaseError, HlocError, WriteError
 from colmap_av1.interop.hloc import HlocMatches, export_hloc, read_hloc
 from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
@@ -289,7 +289,7 @@ def test_failures_leave_nothing(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(DatabaseError, match="no such file"):
         export_hloc(tmp_path / "none.db", tmp_path / "h")
-    with pytest.raises(OptionError, match="cannot be written"):
+    with pytest.raises(WriteError, match="written"):
         export_hloc(tmp_path / "a.db", tmp_path / "file")
     with pytest.raises(DatabaseError, match="no keypoints"):
         export_hloc(tmp_path / "a.db", tmp_path / "h")
