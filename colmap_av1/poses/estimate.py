@@ -300,20 +300,26 @@ def split_at_seams(
     are checked again until no split is left. Motion across a seam is not used any more, because it
     may be wrong there. Links are: without them, a part that returns to a place would fall apart.
 
+    Images of a model with such seams are also removed if their positions are uncertain, see
+    `certain_parts`.
+
     Args:
         run: the run.
         posed: the adjusted poses.
         image_set: the images.
-        only_certain: also remove images whose positions are uncertain, see `certain_parts`.
+        only_certain: remove images with uncertain positions even if there are no such seams.
 
     Returns:
-        The poses of the largest part. If too few images are certain, its mapped model has no
-        images, and the poses of the other stages must not be used.
+        The poses of the largest part. If too few of its images are certain, it is returned with all
+        of them; with `only_certain`, its mapped model then has no images, and the poses of the
+        other stages must not be used.
     """
+    may_bend = only_certain
     for number in count(_FIRST_SPLIT):
         if posed.adjustment is None:
             break
         seams, num_images = _seams_to_split(posed), posed.adjustment.result.num_registered
+        may_bend |= bool(seams)
         parts = None
         if seams:
             parts = split_stage(
@@ -326,14 +332,14 @@ def split_at_seams(
                 number=number,
             )
         if parts is None or parts.result.num_registered == num_images:
-            if not only_certain:
+            if not may_bend:
                 break
             seams = []
             parts = certain_stage(run, image_set, posed.mapped, posed.adjustment, number=number)
             if parts.result.num_registered == num_images:
                 break
         if parts.result.num_registered == 0:
-            return replace(posed, mapped=parts)
+            return replace(posed, mapped=parts) if only_certain else posed
         frame_of = image_set.images.frame_of
         frames = [frame_of[first] for first, _ in seams]
         posed = replace(
