@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_av1.check.database import DatabaseCheck, check_database
-from colmap_av1.check.model import check_model, uncertainty_warning
+from colmap_av1.check.model import check_model
 from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_images, read_pose_priors
@@ -25,7 +25,7 @@ from colmap_av1.errors import (
 from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.geometry.posed_model import posed_model
-from colmap_av1.geometry.uncertainty import MAX_CERTAIN_ERROR, expected_error
+from colmap_av1.geometry.uncertainty import MAX_CERTAIN_ERROR, expected_error, uncertainty_warning
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
 from colmap_av1.matching.few_matches import few_matches_warning

@@ -17,6 +17,7 @@ from colmap_av1.errors import ColmapAv1Error, ModelError, writing
 from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.geometry.track_points import LEAST_AGREEING
+from colmap_av1.geometry.uncertainty import expected_error, uncertainty_warning
 from colmap_av1.images.image_set import ImageSet, ShownVideo
 from colmap_av1.images.inputs import paths_of, read_inputs
 from colmap_av1.images.names import names_of_all
@@ -100,6 +101,8 @@ class ReconstructReport:
         long_range: median long-range epipolar error in pixels, over pairs of images at least ten
             images apart that see the same place; None if there are no such pairs.
         long_range_largest: 90th percentile of the long-range epipolar error.
+        expected_error: expected error of the camera centres as a share of their extent, see
+            `check_model`; None if it is not known.
         read_outs: rolling-shutter read-out time of each video in milliseconds, from the first row
             to the last; None if the tracks were not corrected for it.
         place: where the model lies in the world, as in `place.json`.
@@ -136,6 +139,7 @@ class ReconstructReport:
     mean_error: float
     long_range: float | None
     long_range_largest: float | None
+    expected_error: float | None
     read_outs: tuple[float | None, ...]
     place: Place
     focal_lengths: tuple[float, float]
@@ -281,7 +285,12 @@ def _run_stages(run: Run) -> ReconstructReport:
     assert posed.long_range is not None
     matches, poses, model = posed.matches.result, posed.last.result, written.result
     registered = read_posed_model(run.stages / poses.poses)
-    implausible = focal_length_warning(registered.cameras.values())
+    with run.clock.measure("adjustment"):
+        centre_error = expected_error(registered)
+    further_warnings = (
+        focal_length_warning(registered.cameras.values()),
+        uncertainty_warning(centre_error),
+    )
     long_range = posed.long_range.result
     return ReconstructReport(
         output=run.output,
@@ -304,6 +313,7 @@ def _run_stages(run: Run) -> ReconstructReport:
         mean_error=model.mean_error,
         long_range=long_range.median,
         long_range_largest=long_range.largest,
+        expected_error=centre_error,
         read_outs=tuple(stage.result.read_out for stage in tracked),
         place=placed.result.place,
         focal_lengths=model.focal_lengths,
@@ -326,7 +336,7 @@ def _run_stages(run: Run) -> ReconstructReport:
             *run.inputs.with_names([stage.result.warnings for stage in tracked]),
             *matches.warnings,
             *placed.result.place_warnings,
-            *([implausible] if implausible is not None else []),
+            *(warning for warning in further_warnings if warning is not None),
             *_warnings(posed, model, image_set, further, not_registered),
         ),
         timelines=_timelines(run, image_set, matches.key_images, not_registered),

@@ -187,6 +187,8 @@ def test_poses_are_accurate(made: ReconstructReport, truth: Truth) -> None:
     assert errors.rotation < 0.3
     assert made.num_points > 10_000
     assert made.mean_error < 0.5
+    assert made.expected_error is not None
+    assert 0 < made.expected_error < 0.001
 
 
 def test_report_describes_the_result(made: ReconstructReport, tmp_path: Path) -> None:
@@ -498,6 +500,25 @@ def test_warning_names_images_that_are_not_registered(
     share = f"{len(not_registered)} of {NUM_IMAGES}"
     (warning,) = [warning for warning in found.warnings if share in warning]
     assert not_registered[0] in warning
+
+
+@pytest.mark.parametrize("num_certain", [14, 0])
+def test_uncertain_images_of_a_model_that_may_bend_are_removed(
+    copy: Path, monkeypatch: pytest.MonkeyPatch, num_certain: int
+) -> None:
+    """If no image is certain, all are kept, with a warning."""
+    # Every seam may bend, but none splits the model.
+    monkeypatch.setattr("colmap_av1.poses.seams._LOST", 2.0)
+    monkeypatch.setattr("colmap_av1.poses.seams._SCALED", 1_000_000)
+    monkeypatch.setattr("colmap_av1.poses.seams._DEEP", -1)
+    monkeypatch.setattr("colmap_av1.poses.parts._WITHIN_VIDEO", 0)
+    monkeypatch.setattr("colmap_av1.geometry.uncertainty.MAX_CERTAIN_ERROR", 0.0)
+    certain = {f"frame_{EVERY * i:06d}.jpg" for i in range(num_certain)}
+    monkeypatch.setattr("colmap_av1.poses.parts.certain_parts", lambda *_: [certain])
+    (copy / ".stages" / "adjustment.json").unlink()
+    found = reconstruct(SCENE, copy, options=OPTIONS)
+    assert found.num_registered == (num_certain or NUM_IMAGES)
+    assert any("positions" in warning for warning in found.warnings)
 
 
 def test_adjustment_makes_the_mapped_poses_more_accurate(

@@ -14,7 +14,7 @@ from colmap_av1.check.model_figures import ModelFigures, model_figures
 from colmap_av1.database.file import open_unaltered
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.posed_model import posed_model
-from colmap_av1.geometry.uncertainty import MAX_CERTAIN_ERROR, expected_error
+from colmap_av1.geometry.uncertainty import expected_error, uncertainty_warning
 from colmap_av1.poses.long_range import LongRangeErrors, model_long_range_errors
 from colmap_av1.poses.seams import Seams, model_seams
 from colmap_av1.util.progress import Progress, no_progress
@@ -51,16 +51,6 @@ class ModelCheck:
         far_warning = self.long_range.warning() if self.long_range else None
         found = (far_warning, uncertainty_warning(self.expected_error))
         return (*(warning for warning in found if warning is not None), *self.seam_warnings)
-
-
-def uncertainty_warning(expected_error: float | None) -> str | None:
-    """Warning about uncertain camera positions."""
-    if expected_error is None or expected_error <= MAX_CERTAIN_ERROR:
-        return None
-    return (
-        f"few points with parallax determine the camera positions: expect errors of "
-        f"{expected_error:.1%} of their extent or more; move sideways more while filming"
-    )
 
 
 def check_model(

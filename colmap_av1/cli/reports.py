@@ -143,6 +143,7 @@ def reconstruct_rows(report: ReconstructReport) -> Rows:
         ("reprojection error", f"{report.mean_error:.3f} px"),
         *_long_range_rows(report.long_range, report.long_range_largest),
         _focal_length_row(report.focal_lengths),
+        *_expected_error_row(report.expected_error),
         *_shutter_row(report.read_outs),
         *_place_rows(report.place),
         *_link_rows(report.links),

@@ -57,6 +57,16 @@ def expected_error(model: PosedModel) -> float | None:
     return float(np.sqrt(np.mean(errors**2))) if np.isfinite(errors).all() else None
 
 
+def uncertainty_warning(error: float | None) -> str | None:
+    """Warning about an `expected_error` that is large; None if it is small or not known."""
+    if error is None or error <= MAX_CERTAIN_ERROR:
+        return None
+    return (
+        f"few points with parallax determine the camera positions: expect errors of "
+        f"{error:.1%} of their extent or more; move sideways more while filming"
+    )
+
+
 def centre_uncertainty(model: PosedModel) -> Floats:
     """Expected errors of the camera centres that follow from errors of the observations.
 

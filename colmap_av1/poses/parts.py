@@ -10,8 +10,8 @@ With wrong poses, points may seem to have parallax: while a camera turns, a moti
 much like a rotation. If the images were mapped twice, and the second result fits the observations
 hardly better than the first, the places must have parallax in both.
 
-Models other than the first also lose images at the ends of their videos, until the positions of the
-others are certain.
+Models that may bend, and all models but the first, also lose images at the ends of their videos,
+until the positions of the others are certain.
 """
 
 from __future__ import annotations
