@@ -83,7 +83,7 @@ def adjustment_stage(
     posed: Kept[PosesResult],
     *,
     dynamic_masks: Mapping[str, Mask],
-    masked: str | None,
+    masks_digest: str | None,
     has_picture_positions: bool,
     is_fast: bool = False,
     number: int = 1,
@@ -102,7 +102,7 @@ def adjustment_stage(
         posed: the stage with the initial poses.
         dynamic_masks: masks that exclude dynamic pixels, by image name; `tracks` and `links` have
             none of these pixels.
-        masked: digest of the stage that found them; None if there are none.
+        masks_digest: digest of the stage that found them; None if there are none.
         has_picture_positions: whether tracks have positions in the pictures; else the pictures are
             not used.
         is_fast: the camera turns fast somewhere, so that the scale may be poorly determined.
@@ -164,7 +164,13 @@ def adjustment_stage(
     return run_stage(
         run.stages,
         f"adjustment{suffix}",
-        [posed.digest, given, options.match.camera.single_camera, has_picture_positions, masked],
+        [
+            posed.digest,
+            given,
+            options.match.camera.single_camera,
+            has_picture_positions,
+            masks_digest,
+        ],
         AdjustedResult,
         products=[f"adjusted{suffix}.npz"],
         make=make,

@@ -460,7 +460,7 @@ def _long_range_check(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongR
         image_set,
         posed.dynamic_masks,
         posed.last,
-        masked=posed.masks_digest,
+        masks_digest=posed.masks_digest,
         linked=posed.matches.result.links.searched_all,
     )
 
@@ -521,7 +521,7 @@ def _adjusted(
         image_set,
         poses,
         dynamic_masks=posed.dynamic_masks,
-        masked=posed.masks_digest,
+        masks_digest=posed.masks_digest,
         has_picture_positions=posed.has_picture_positions,
         is_fast=bool(posed.matches.result.links.fast),
         number=number,

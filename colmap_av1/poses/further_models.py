@@ -19,7 +19,7 @@ from colmap_av1.poses.estimate import (
     trusted_tracks,
 )
 from colmap_av1.poses.mapping_stage import MappedResult
-from colmap_av1.poses.parts import FEWEST_IMAGES
+from colmap_av1.poses.parts import MIN_MODEL_SIZE
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import LEAST_IMAGES
 from colmap_av1.tracks.tracks import Tracks
@@ -114,7 +114,7 @@ def further_poses(
         if posed is not None:
             registered = _registered(own, posed)
             is_certain = posed.mapped.result.num_registered > 0
-            if is_certain and len(registered & left) >= FEWEST_IMAGES:
+            if is_certain and len(registered & left) >= MIN_MODEL_SIZE:
                 used = registered & left
             # If a model is not used, its parts must not grow into it again.
             excluded = frozenset() if used else mapped.excluded | registered | known

@@ -55,7 +55,7 @@ def long_range_stage(
     dynamic_masks: Mapping[str, Mask],
     posed: Kept[PosesResult],
     *,
-    masked: str | None,
+    masks_digest: str | None,
     linked: bool,
 ) -> Kept[LongRangeResult]:
     """Match a few pairs of images far apart in time, and compare the matches with the poses.
@@ -66,7 +66,7 @@ def long_range_stage(
         image_set: the images.
         dynamic_masks: masks that exclude dynamic pixels, by image name.
         posed: the stage that estimated the poses.
-        masked: digest of the stage that made the masks; None without masks.
+        masks_digest: digest of the stage that made the masks; None without masks.
         linked: whether loop closures have been searched.
     """
 
@@ -83,7 +83,7 @@ def long_range_stage(
     return run_stage(
         run.stages,
         "long_range",
-        [posed.digest, masked, linked],
+        [posed.digest, masks_digest, linked],
         LongRangeResult,
         products=[],
         make=make,

@@ -37,7 +37,7 @@ from colmap_av1.util.stages import Kept, run_stage
 
 # Further models with fewer images are dropped, as by COLMAP's mapper (`min_model_size`). Most of
 # them show a turn on the spot, which does not determine their shape.
-FEWEST_IMAGES = 10
+MIN_MODEL_SIZE = 10
 # Stretches of different videos are connected by at least this many common points, the number of
 # inliers that COLMAP's mapper requires of a pair of images.
 _BETWEEN_VIDEOS = 15
@@ -165,7 +165,7 @@ def certain_parts(model: PosedModel, image_set: ImageSet) -> list[AbstractSet[st
     is_posed = np.isin(image_set.images.names, [image.name for image in model.images])
     names, videos = np.array(image_set.images.names)[is_posed], image_set.sequence[is_posed]
     kept = np.ones(len(names), np.bool_)
-    while FEWEST_IMAGES <= np.count_nonzero(kept) <= MAX_IMAGES:
+    while MIN_MODEL_SIZE <= np.count_nonzero(kept) <= MAX_IMAGES:
         part = _with_images(model, set(names[kept].tolist()))
         error_of = dict(zip(part.by_name, centre_uncertainty(part).tolist(), strict=True))
         errors = np.array([error_of.get(name, 0.0) for name in names.tolist()])
@@ -176,10 +176,10 @@ def certain_parts(model: PosedModel, image_set: ImageSet) -> list[AbstractSet[st
             is_end = np.diff(videos[left], prepend=-1, append=-1) != 0
             ends = left[is_end[:-1] | is_end[1:]]
             kept[ends[errors[ends].argmax()]] = False
-    certain = set(names[kept].tolist()) if np.count_nonzero(kept) >= FEWEST_IMAGES else set[str]()
+    certain = set(names[kept].tolist()) if np.count_nonzero(kept) >= MIN_MODEL_SIZE else set[str]()
     stretch = np.cumsum((np.diff(kept, prepend=True) != 0) | (np.diff(videos, prepend=-1) != 0))
     removed = [set(names[~kept & (stretch == k)].tolist()) for k in np.unique(stretch[~kept])]
-    return [certain, *(own for own in removed if len(own) >= FEWEST_IMAGES)]
+    return [certain, *(own for own in removed if len(own) >= MIN_MODEL_SIZE)]
 
 
 def _with_images(model: PosedModel, names: AbstractSet[str]) -> PosedModel:
@@ -224,7 +224,7 @@ def parts_of(
     component = connected_components(len(sequence_of), np.argwhere(is_connected))[of_image]
     parts = [set(registered[component == number].tolist()) for number in np.unique(component)]
     parts.sort(key=lambda part: -len(part))
-    return [parts[0], *(part for part in parts[1:] if len(part) >= FEWEST_IMAGES)]
+    return [parts[0], *(part for part in parts[1:] if len(part) >= MIN_MODEL_SIZE)]
 
 
 def _common_points(
