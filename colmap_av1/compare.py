@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.check.model_figures import model_figures
 from colmap_av1.errors import ColmapAv1Error, ImageError, ModelError, OptionError
@@ -18,13 +17,13 @@ from colmap_av1.evaluate.frontends.frontend import Frontend, run_frontend
 from colmap_av1.evaluate.frontends.imported import imported_frontend
 from colmap_av1.evaluate.frontends.mapping import densify_model, measure_mapper
 from colmap_av1.evaluate.frontends.registry import make_frontends
-from colmap_av1.evaluate.metrics.clouds import cloud_distances, point_cloud
+from colmap_av1.evaluate.metrics.clouds import cloud_distances
 from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses, pose_errors, read_poses
 from colmap_av1.evaluate.programs import check_packages
 from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
 from colmap_av1.evaluate.training.trainers import check_trainer, train, write_split
 from colmap_av1.geometry.alignment import transform_poses
-from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import point_colours, point_positions, read_model
 from colmap_av1.geometry.observable import has_observable_depth
 from colmap_av1.options import CompareOptions, DensifyOptions, MapOptions
 from colmap_av1.tracks.video_tracks import with_stream_kept
@@ -309,7 +308,7 @@ def _larger(a: int | None, b: int | None) -> int | None:
 def _read_reference(path: Path, footage: Footage) -> _Reference:
     if path.is_dir():
         model = read_model(path)
-        poses, points = image_poses(model, footage.names), point_cloud(model)
+        poses, points = image_poses(model, footage.names), point_positions(model)
     else:
         poses = read_poses(path, footage.num_frames)[list(footage.frames)]
         points = np.empty((0, 3))
@@ -340,7 +339,7 @@ def _with_pseudo_truth(given: _Reference, columns: list[Column], footage: Footag
         if column is None or column.model_path is None:
             continue
         model = read_model(column.model_path)
-        poses, points = image_poses(model, footage.names), point_cloud(model)
+        poses, points = image_poses(model, footage.names), point_positions(model)
         if given.poses is None:
             return _Reference(poses, points, name, name)
         similarity, errors = fit_similarity(poses, given.poses), pose_errors(poses, given.poses)
@@ -357,7 +356,7 @@ def _measure(
     if column.model_path is None:
         return column, None
     model = read_model(column.model_path)
-    poses, points = image_poses(model, footage.names), point_cloud(model)
+    poses, points = image_poses(model, footage.names), point_positions(model)
     # A track may have several keypoints in the same image.
     lengths = [len({e.image_id for e in p.track.elements}) for p in model.points3D.values()]
     counts = np.bincount(np.array(lengths, dtype=np.int64))
@@ -382,19 +381,13 @@ def _measure(
         poses = transform_poses(similarity, poses)
     cloud = Cloud(
         points=points,
-        colours=_colours(model),
+        colours=point_colours(model),
         observable=has_observable_depth(model),
         cam_from_world=poses,
         focal_length=_focal_length(model),
         is_aligned=similarity is not None,
     )
     return column, cloud
-
-
-def _colours(model: pycolmap.Reconstruction) -> NDArray[np.uint8]:
-    """Colours of the points, in the order of their ids."""
-    colours = [model.points3D[i].color for i in sorted(model.points3D)]
-    return np.array(colours, dtype=np.uint8).reshape(-1, 3)
 
 
 def _focal_length(model: pycolmap.Reconstruction) -> float:

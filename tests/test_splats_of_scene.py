@@ -13,8 +13,12 @@ import render_scene
 from dense_scene import OPTIONS, SCENE, Truth
 
 from colmap_av1.densify import densify
-from colmap_av1.evaluate.metrics.clouds import point_cloud
-from colmap_av1.geometry.colmap_model import ModelImage, camera_centres, write_model
+from colmap_av1.geometry.colmap_model import (
+    ModelImage,
+    camera_centres,
+    point_positions,
+    write_model,
+)
 from colmap_av1.geometry.coverage import coverage_of_model
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.options import DensifyOptions, ImageOptions, MatchOptions, TriangulateOptions
@@ -58,7 +62,7 @@ def errors(model: pycolmap.Reconstruction) -> np.ndarray:
 def test_points_lie_on_the_surfaces(dense: Path) -> None:
     """Errors are relative to the distance, for observed points and for those that fill holes."""
     model = pycolmap.Reconstruction(dense)
-    xyz = point_cloud(model)
+    xyz = point_positions(model)
     centres = np.array([model.images[i].projection_center() for i in sorted(model.images)])
     away = np.linalg.norm(xyz[:, None] - centres[None, ::5], axis=2).min(axis=1)
     off = np.abs(render_scene.surface_distance(render_scene.build_scene(), xyz)) / away
@@ -74,7 +78,7 @@ def test_points_lie_on_the_surfaces(dense: Path) -> None:
 
 def test_no_point_floats_in_front_of_the_nearest_surface(dense: Path, truth: Truth) -> None:
     """Tested inside and around the images, with a tolerance for depth noise."""
-    xyz = point_cloud(pycolmap.Reconstruction(dense))
+    xyz = point_positions(pycolmap.Reconstruction(dense))
     fx, fy, cx, cy = truth.camera.params
     for frame in FRAMES:
         pose = truth.cam_from_world[frame]
@@ -114,7 +118,7 @@ def test_images_may_be_smaller_than_the_video(truth: Truth, tmp_path: Path) -> N
     long_tracks = replace(SPLATS, triangulate=TriangulateOptions(min_observations=25))
     report = densify(tmp_path / "true", SCENE, tmp_path / "dense", options=long_tracks)
     assert report.coverage > 0.99
-    xyz = point_cloud(pycolmap.Reconstruction(tmp_path / "dense"))
+    xyz = point_positions(pycolmap.Reconstruction(tmp_path / "dense"))
     centres = camera_centres(truth.cam_from_world)
     away = np.linalg.norm(xyz[:, None] - centres[None, ::10], axis=2).min(axis=1)
     off = np.abs(render_scene.surface_distance(render_scene.build_scene(), xyz)) / away

@@ -76,6 +76,18 @@ def posed_images(reconstruction: pycolmap.Reconstruction) -> dict[str, ModelImag
     }
 
 
+def point_positions(reconstruction: pycolmap.Reconstruction) -> Floats:
+    """The points of a pycolmap.Reconstruction: float64 [n, 3], in the order of their ids."""
+    xyz = [reconstruction.points3D[i].xyz for i in sorted(reconstruction.points3D)]
+    return np.array(xyz, dtype=np.float64).reshape(-1, 3)
+
+
+def point_colours(reconstruction: pycolmap.Reconstruction) -> NDArray[np.uint8]:
+    """The colours of these points: uint8 [n, 3] RGB, in the order of their ids."""
+    rgb = [reconstruction.points3D[i].color for i in sorted(reconstruction.points3D)]
+    return np.array(rgb, dtype=np.uint8).reshape(-1, 3)
+
+
 def model_points(
     reconstruction: pycolmap.Reconstruction, images: Sequence[ModelImage]
 ) -> ModelPoints:
@@ -94,8 +106,8 @@ def model_points(
     own = [[e for e in p.track.elements if int(e.image_id) in index] for p in points]
     seen = [element for elements in own for element in elements]
     return ModelPoints(
-        xyz=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
-        rgb=np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
+        xyz=point_positions(reconstruction),
+        rgb=point_colours(reconstruction),
         error=np.array([p.error for p in points], dtype=np.float64),
         offsets=np.cumsum([0, *map(len, own)], dtype=np.int64),
         image=np.array([index[int(e.image_id)] for e in seen], dtype=np.int64),
@@ -129,6 +141,7 @@ def write_model(
             file.write(struct.pack("<IiQQ", camera_id, int(camera.model.value), *size))
             file.write(np.asarray(camera.params, dtype="<f8").tobytes())
 
+    point = points.point
     by_image, bounds = grouped(points.image, len(images))
     index_in_image = np.empty(len(points.image), dtype=np.int64)
     index_in_image[by_image] = np.arange(len(by_image)) - np.repeat(bounds[:-1], np.diff(bounds))
@@ -141,7 +154,7 @@ def write_model(
             file.write(image.name.encode() + b"\0")
             seen = by_image[start:stop]
             rows = np.empty(len(seen), dtype=OBSERVATION)
-            rows["xy"], rows["point3D_id"] = points.xy[seen], points.point[seen] + 1
+            rows["xy"], rows["point3D_id"] = points.xy[seen], point[seen] + 1
             file.write(struct.pack("<Q", len(rows)))
             file.write(rows.tobytes())
 

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from colmap_av1 import _core
-from colmap_av1.geometry.colmap_model import ModelImage, posed_images
+from colmap_av1.geometry.colmap_model import ModelImage, point_positions, posed_images
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.spread import evenly_spread
@@ -201,8 +201,7 @@ def coverage_of_model(reconstruction: pycolmap.Reconstruction) -> float:
     images = sorted(posed_images(reconstruction).values(), key=lambda image: image.name)
     cameras = reconstruction.cameras
     views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in images]
-    xyz = np.array([p.xyz for p in reconstruction.points3D.values()], np.float64)
-    return coverage(views, xyz.reshape(-1, 3))
+    return coverage(views, point_positions(reconstruction))
 
 
 def nearest_depth(view: PosedCamera, xyz: Floats) -> Floats:

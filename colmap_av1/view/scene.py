@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.colmap_model import (
     ModelImage,
     camera_centres,
+    point_colours,
+    point_positions,
     posed_images,
     read_model,
 )
@@ -83,7 +85,6 @@ def read_scene(model: str | os.PathLike[str], *, up: Floats | None = None) -> Sc
         ModelError: the folder has no model, or a model without poses.
     """
     reconstruction = read_model(model)
-    points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
     images = sorted(
         posed_images(reconstruction).values(), key=lambda image: natural_key(image.name)
     )
@@ -95,12 +96,12 @@ def read_scene(model: str | os.PathLike[str], *, up: Floats | None = None) -> Sc
     elif abs(back @ up) > _VERTICAL:
         back = -top
     back = normalised(back - up * (back @ up))
-    colours = np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3)
+    colours = point_colours(reconstruction)
     if not colours.any():  # mapped without images
         colours[:] = _NO_COLOUR
     return Scene(
         model=reconstruction,
-        points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
+        points=point_positions(reconstruction),
         colours=colours,
         observable=has_observable_depth(reconstruction),
         images=images,

@@ -26,8 +26,7 @@ from scipy.spatial import KDTree
 
 from colmap_av1 import DensifyOptions, MatchOptions, TrackOptions, densify
 from colmap_av1.evaluate import run_measured
-from colmap_av1.evaluate.metrics.clouds import point_cloud
-from colmap_av1.geometry.colmap_model import ModelImage, read_model, write_model
+from colmap_av1.geometry.colmap_model import ModelImage, point_positions, read_model, write_model
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.options import TriangulateOptions
 
@@ -118,7 +117,7 @@ def figures(dense: Any, off: NDArray[np.float64], given: int | None) -> dict[str
 
 def surface_errors(dense: Any, script: Any, scene: Any) -> NDArray[np.float64]:
     """Distances of points to the nearest surface, relative to those from the first camera."""
-    xyz = point_cloud(dense)
+    xyz = point_positions(dense)
     first = [
         min(e.image_id for e in dense.points3D[i].track.elements) for i in sorted(dense.points3D)
     ]
@@ -160,7 +159,7 @@ def depth_differences(
         reference's depth; NaN if no reference point is near.
     """
     ids = sorted(model.points3D)
-    xyz = point_cloud(model)
+    xyz = point_positions(model)
     middle = np.array([_middle_image(model.points3D[i].track) for i in ids], np.int64)
     difference = np.full(len(ids), np.nan)
     for image_id in np.unique(middle):

@@ -9,9 +9,10 @@ from dense_points import depth_differences
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from colmap_av1.evaluate.metrics.clouds import cloud_distances, point_cloud
+from colmap_av1.evaluate.metrics.clouds import cloud_distances
 from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses, pose_errors
 from colmap_av1.geometry.alignment import transform_poses
+from colmap_av1.geometry.colmap_model import point_positions
 
 
 def test_distances_of_known_clouds() -> None:
@@ -69,13 +70,15 @@ def test_models_are_aligned_by_their_cameras() -> None:
     moved = copy.deepcopy(model)
     turn = pycolmap.Rotation3d(np.array([0.1, -0.3, 0.2, 0.9]) / np.sqrt(0.95))
     moved.transform(pycolmap.Sim3d(2.5, turn, np.array([3.0, -1, 7])))
-    assert np.abs(point_cloud(moved) - point_cloud(model)).max() > 1
+    assert np.abs(point_positions(moved) - point_positions(model)).max() > 1
     names = sorted(image.name for image in model.images.values())
     poses = image_poses(model, [*names, "not there"])
     assert np.isnan(poses[-1]).all()
     similarity = fit_similarity(image_poses(moved, names), poses[:-1])
     assert similarity is not None
-    np.testing.assert_allclose(similarity * point_cloud(moved), point_cloud(model), atol=1e-6)
+    np.testing.assert_allclose(
+        similarity * point_positions(moved), point_positions(model), atol=1e-6
+    )
     np.testing.assert_allclose(
         transform_poses(similarity, image_poses(moved, names)), poses[:-1], atol=1e-6
     )

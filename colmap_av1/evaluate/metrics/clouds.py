@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from scipy.spatial import KDTree
 
 from colmap_av1.util.arrays import Floats
@@ -63,9 +62,3 @@ def cloud_distances(points: Floats, reference: Floats) -> CloudDistances | None:
         robust_hausdorff=float(max(np.quantile(to_reference, 0.95), np.quantile(to_points, 0.95))),
         extent=extent,
     )
-
-
-def point_cloud(model: pycolmap.Reconstruction) -> Floats:
-    """The points of a pycolmap.Reconstruction: float64 [n, 3], in the order of their ids."""
-    points = [model.points3D[i].xyz for i in sorted(model.points3D)]
-    return np.array(points, dtype=np.float64).reshape(-1, 3)

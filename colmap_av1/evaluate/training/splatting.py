@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ModelError
 from colmap_av1.evaluate.metrics.renderings import RenderingMetrics
 from colmap_av1.geometry.cameras import is_undistorted
-from colmap_av1.geometry.colmap_model import read_model
+from colmap_av1.geometry.colmap_model import point_colours, point_positions, read_model
 from colmap_av1.util.arrays import Floats
 
 # The mean distance to this many nearest points is the initial size of a point's Gaussian.
@@ -122,8 +122,7 @@ def write_scene(model: Path, image_path: Path, path: Path) -> None:
     test = set(split_images([image.name for image in images])[1])
     poses = np.tile(np.eye(4, dtype=np.float32), (len(images), 1, 1))
     poses[:, :3] = [image.cam_from_world().matrix() for image in images]
-    points = reconstruction.points3D.values()
-    xyz = np.array([point.xyz for point in points])
+    xyz = point_positions(reconstruction)
     np.savez(
         path,
         files=np.array([str(image_path / image.name) for image in images]),
@@ -131,7 +130,7 @@ def write_scene(model: Path, image_path: Path, path: Path) -> None:
         cam_from_world=poses,
         K=np.array([_intrinsics(model, image.camera) for image in images], dtype=np.float32),
         points=xyz.astype(np.float32),
-        colors=np.array([point.color for point in points], dtype=np.float32) / 255,
+        colors=point_colours(reconstruction).astype(np.float32) / 255,
         spacing=_spacing(xyz),
     )
 
