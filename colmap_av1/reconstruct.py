@@ -25,8 +25,9 @@ from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.options import MatchOptions, ReconstructOptions
-from colmap_av1.poses.estimate import Posed, estimate_poses
+from colmap_av1.poses.estimate import estimate_poses
 from colmap_av1.poses.placing.placement import Place
+from colmap_av1.poses.posed import Posed
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import (
     encoding_for_pictures,

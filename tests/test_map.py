@@ -194,7 +194,7 @@ def test_intrinsics_are_kept_or_refined(database: Path, images: Path, tmp_path: 
         given = pycolmap.Database.open(copy)
         (camera,) = given.read_all_cameras()
         given.close()
-        return camera.mean_focal_length(), report.figures.focal_length
+        return camera.mean_focal_length(), report.figures.focal_lengths[0]
 
     copy = tmp_path / "copy.db"
     shutil.copyfile(database, copy)

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 from colmap_av1.errors import ModelError, writing
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.estimate import (
+from colmap_av1.poses.mapping_stage import MappedResult
+from colmap_av1.poses.parts import MIN_MODEL_SIZE
+from colmap_av1.poses.posed import (
     Posed,
     refined_poses,
     remapped_poses,
     split_at_seams,
     trusted_tracks,
 )
-from colmap_av1.poses.mapping_stage import MappedResult
-from colmap_av1.poses.parts import MIN_MODEL_SIZE
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import LEAST_IMAGES
 from colmap_av1.tracks.tracks import Tracks

@@ -26,7 +26,7 @@ from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.adjustment_stage import AdjustedResult
-from colmap_av1.poses.estimate import Posed, estimate_poses
+from colmap_av1.poses.estimate import estimate_poses
 from colmap_av1.poses.further_models import further_poses
 from colmap_av1.poses.joint_cameras import joint_cameras
 from colmap_av1.poses.long_range_stage import LongRangeResult
@@ -36,6 +36,7 @@ from colmap_av1.poses.matched_observations import (
     limits_of_density,
     matched_observations,
 )
+from colmap_av1.poses.posed import Posed
 from colmap_av1.poses.posed_images import PosedImages, posed_images_of, triangulate_in
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.starting_pair import StartingPair, starting_pair

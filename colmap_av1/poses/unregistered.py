@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import DensityOptions
-from colmap_av1.poses.estimate import Posed
+from colmap_av1.poses.posed import Posed
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.tracks.selection import select_tracks

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.estimate import Posed
 from colmap_av1.poses.further_models import further_poses
 from colmap_av1.poses.placing.stage import PlaceResult, place_stage
+from colmap_av1.poses.posed import Posed
 from colmap_av1.poses.posed_images import read_posed_images
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import read_tracks_only

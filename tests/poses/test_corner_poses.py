@@ -146,7 +146,7 @@ def test_links_join_images_across_a_gap_in_the_tracks(
         image_set,
         Kept(PosesResult("placed.npz", NUM_IMAGES), "", resumed=False),
         dynamic_masks={},
-        masked=None,
+        masks_digest=None,
         has_picture_positions=True,
     )
     found = read_posed_model(tmp_path / adjusted.result.poses).by_name

@@ -1,0 +1,372 @@
+"""The sequence of stages that estimates all poses.
+
+The key images are matched and mapped, the poses of the images in between are found by resection,
+dynamic objects are masked, and all poses are adjusted. Doubtful models are mapped again from their
+adjusted observations, and split at seams that hardly any points connect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+
+from colmap_av1.errors import ModelError
+from colmap_av1.geometry.masks import Mask
+from colmap_av1.images.image_set import ImageSet
+from colmap_av1.poses.adjustment_stage import AdjustedResult, adjustment_stage
+from colmap_av1.poses.dynamic.stage import (
+    DynamicResult,
+    dynamic_stage,
+    read_dynamic_masks,
+    without_dynamic_links,
+    without_dynamic_tracks,
+)
+from colmap_av1.poses.long_range_stage import LongRangeResult, long_range_stage
+from colmap_av1.poses.mapping_stage import (
+    MappedResult,
+    mapping_stage,
+    with_model_first,
+)
+from colmap_av1.poses.match_stage import MatchesResult, match_stage, read_links
+from colmap_av1.poses.parts import certain_stage, split_stage
+from colmap_av1.poses.posed_images import PosesResult
+from colmap_av1.poses.remapping import remap_stage
+from colmap_av1.poses.resection_stage import resection_stage
+from colmap_av1.poses.run import Run
+from colmap_av1.poses.track_stage import VideoTracks
+from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.stages import Kept
+
+# Number of the adjustment after the first split; 1 and 2 follow the first and second mapping.
+_FIRST_SPLIT = 3
+# A second mapping of the first model must agree with this share of the observations.
+_LEAST_KEPT = 0.9
+
+
+@dataclass(frozen=True)
+class Posed:
+    """The finished stages of the joint estimate, and the tracks that agree with its poses.
+
+    Attributes:
+        matches: the database of the key images, see `match_stage`; that of the first model.
+        mapped: the poses of the key images, see `mapping_stage`; after a second mapping or a split,
+            those of all its images.
+        resection: the poses of the images in between; None if all images are key images.
+        dynamic: the dynamic objects; None if they were not looked for.
+        adjustment: the adjusted poses; None if they are not adjusted.
+        tracks: the tracks of all videos, cut at gaps that links replace and at seams of splits,
+            without dynamic pixels.
+        links: links as tracks, without dynamic pixels.
+        dynamic_masks: masks that exclude dynamic objects, by image name.
+        has_picture_positions: whether tracks have positions in the pictures; false if they were
+            corrected for a rolling shutter.
+        long_range: the long-range check; None if it was not made.
+        rival: the adjustment of the first mapping if a second one replaced it, but fits the
+            observations hardly better; else None.
+    """
+
+    matches: Kept[MatchesResult]
+    mapped: Kept[MappedResult]
+    resection: Kept[PosesResult] | None
+    dynamic: Kept[DynamicResult] | None
+    adjustment: Kept[AdjustedResult] | None
+    tracks: Tracks
+    links: Tracks
+    dynamic_masks: dict[str, Mask]
+    has_picture_positions: bool
+    long_range: Kept[LongRangeResult] | None = None
+    rival: Kept[AdjustedResult] | None = None
+
+    @property
+    def last(self) -> Kept[PosesResult]:
+        """The stage with the final poses."""
+        return self.adjustment or self.resection or self.mapped
+
+    @property
+    def masks_digest(self) -> str | None:
+        """Digest of the stage that found dynamic objects; None if there are none."""
+        return self.dynamic.digest if self.dynamic is not None and self.dynamic_masks else None
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether pictures far apart in time contradict the poses."""
+        return self.long_range is not None and self.long_range.result.contradicts_poses
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether pictures far apart in time agree with the poses."""
+        is_checked = self.long_range is not None and self.long_range.result.median is not None
+        return is_checked and not self.is_contradicted
+
+    @property
+    def seams_to_split(self) -> list[tuple[str, str]]:
+        """Names of the images before and after each seam to split the model at."""
+        if self.adjustment is None:
+            return []
+        adjusted = self.adjustment.result
+        seams = adjusted.doubtful_seams if self.is_contradicted else adjusted.few_point_seams
+        return sorted({*seams, *adjusted.scale_lost_seams})
+
+    @property
+    def resumed(self) -> list[str]:
+        """Names of the stages that an earlier run finished, in order."""
+        stages: dict[str, Kept[object] | None] = {
+            "matches": self.matches,
+            "poses": self.mapped,
+            "resection": self.resection,
+            "dynamic": self.dynamic,
+            "adjustment": self.adjustment,
+            "long_range": self.long_range,
+        }
+        return [name for name, stage in stages.items() if stage is not None and stage.resumed]
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """The matched images and the mapper's models of them.
+
+    Attributes:
+        matched: the database of the key images.
+        keyed: the key images.
+        models: the mapper's models.
+    """
+
+    matched: Kept[MatchesResult]
+    keyed: ImageSet
+    models: Kept[MappedResult]
+
+
+def map_key_images(
+    run: Run, videos: Sequence[VideoTracks], image_set: ImageSet, *, doubted: Sequence[int]
+) -> Mapped:
+    """Match and map the key images; `doubted` as in `match_stage`."""
+    matched = match_stage(run, videos, image_set, doubted)
+    depth = matched.result.depth
+    if not depth.is_observable:
+        raise ModelError(f"{run.inputs.name}: {depth.warning}")
+    keyed = image_set.some(matched.result.key_images)
+    return Mapped(matched, keyed, mapping_stage(run, matched, image_set, keyed))
+
+
+def pose_images(
+    run: Run,
+    videos: Sequence[VideoTracks],
+    image_set: ImageSet,
+    found: Mapped,
+    first: str | None,
+) -> Posed:
+    """Resect and adjust.
+
+    Args:
+        run: the run.
+        videos: the tracks of each video.
+        image_set: the images.
+        found: the mapper's models.
+        first: file of the one to continue with; None for the largest.
+    """
+    mapped = found.models
+    if first is not None:
+        mapped = with_model_first(run, mapped, first)
+    # Without a read-out time the tracks were not corrected.
+    has_picture_positions = not any(own.read_out for own in videos)
+    trusted = trusted_tracks(run, [own.tracks for own in videos], image_set)
+    posed = refined_poses(
+        run,
+        found.matched,
+        mapped,
+        trusted=trusted,
+        image_set=image_set,
+        keyed=found.keyed,
+        has_picture_positions=has_picture_positions,
+    )
+    if _is_doubtful(posed):
+        posed = remapped_poses(run, posed, image_set, least_kept=_LEAST_KEPT)
+    return replace(posed, long_range=_long_range_check(run, posed, image_set))
+
+
+def _long_range_check(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongRangeResult]:
+    """The long-range check of the poses."""
+    return long_range_stage(
+        run,
+        posed.tracks,
+        image_set,
+        posed.dynamic_masks,
+        posed.last,
+        masks_digest=posed.masks_digest,
+        linked=posed.matches.result.links.searched_all,
+    )
+
+
+def trusted_tracks(
+    run: Run, tracks: Sequence[Tracks], image_set: ImageSet
+) -> tuple[Tracks, Tracks]:
+    """The tracks of all videos, cut at gaps that links replace, and the links."""
+    links, broken = read_links(run.stages)
+    every = Tracks.in_sequence(tracks, image_set.num_frames)
+    return every.split_after_frames(broken.tolist()), links
+
+
+def _is_doubtful(posed: Posed) -> bool:
+    """Whether the adjusted model may have a wrong focal length, or bend where links replace motion.
+
+    It may bend if points connect it poorly somewhere, or if it was mapped with an assumed focal
+    length.
+    """
+    if posed.adjustment is None:
+        return False
+    matches, adjusted = posed.matches.result, posed.adjustment.result
+    is_weak = adjusted.doubtful_seams or adjusted.scale_lost_seams or matches.assumes_focal_length
+    may_bend = (matches.links.gaps or matches.links.fast) and is_weak
+    return bool(adjusted.has_long_focal_length or may_bend)
+
+
+def remapped_poses(run: Run, posed: Posed, image_set: ImageSet, *, least_kept: float) -> Posed:
+    """Map the images again from the adjusted observations, and use that unless its cost is higher.
+
+    See `remapping`. Nothing is mapped again if the adjustment did not use corners.
+
+    Args:
+        run: the run.
+        posed: the adjusted poses.
+        image_set: the images.
+        least_kept: the second mapping is rejected if a smaller share of the observations agrees
+            with it.
+    """
+    if posed.adjustment is None or not posed.has_picture_positions:
+        return posed
+    again = remap_stage(run, image_set, posed.mapped, posed.adjustment)
+    if not again.result.fits(least_kept):
+        return posed
+    rival = None if again.result.is_clearly_better else posed.adjustment
+    posed = replace(posed, mapped=again, rival=rival)
+    return replace(posed, adjustment=_adjusted(run, posed, image_set, again, number=2))
+
+
+def _adjusted(
+    run: Run, posed: Posed, image_set: ImageSet, poses: Kept[PosesResult], *, number: int = 1
+) -> Kept[AdjustedResult]:
+    """Adjust poses, see `adjustment_stage`."""
+    return adjustment_stage(
+        run,
+        posed.tracks,
+        posed.links,
+        image_set,
+        poses,
+        dynamic_masks=posed.dynamic_masks,
+        masks_digest=posed.masks_digest,
+        has_picture_positions=posed.has_picture_positions,
+        is_fast=bool(posed.matches.result.links.fast),
+        number=number,
+    )
+
+
+def refined_poses(
+    run: Run,
+    matched: Kept[MatchesResult],
+    mapped: Kept[MappedResult],
+    *,
+    trusted: tuple[Tracks, Tracks],
+    image_set: ImageSet,
+    keyed: ImageSet,
+    has_picture_positions: bool,
+) -> Posed:
+    """Estimate the poses of the images between the key images, and adjust all poses.
+
+    Args:
+        run: the run.
+        matched: the database that was mapped.
+        mapped: the poses of the mapper.
+        trusted: the tracks and links, see `trusted_tracks`.
+        image_set: the images.
+        keyed: the key images.
+        has_picture_positions: see `Posed`.
+    """
+    tracks, links = trusted
+    resection = dynamic = None
+    poses: Kept[PosesResult] = mapped
+    if len(keyed.sequence) < len(image_set.sequence):
+        poses = resection = resection_stage(run, tracks, image_set, keyed, mapped)
+    dynamic_masks: dict[str, Mask] = {}
+    if run.options.moving != "keep":
+        dynamic = dynamic_stage(run, tracks, image_set, poses)
+        dynamic_masks = read_dynamic_masks(run.stages)
+    tracks = without_dynamic_tracks(tracks, image_set, dynamic_masks, run)
+    links = without_dynamic_links(links, image_set, dynamic_masks)
+    posed = Posed(
+        matches=matched,
+        mapped=mapped,
+        resection=resection,
+        dynamic=dynamic,
+        adjustment=None,
+        tracks=tracks,
+        links=links,
+        dynamic_masks=dynamic_masks,
+        has_picture_positions=has_picture_positions,
+    )
+    if not run.options.mapping.adjust:
+        return posed
+    return replace(posed, adjustment=_adjusted(run, posed, image_set, poses))
+
+
+def split_at_seams(
+    run: Run, posed: Posed, image_set: ImageSet, *, only_certain: bool = False
+) -> Posed:
+    """Split the model at seams with few points, and adjust the largest part separately.
+
+    If pictures far apart in time contradict the poses, it is split at doubtful seams, too. The
+    separate adjustment may change the number of points at a seam, so the seams of the largest part
+    are checked again until no split is left. Motion across a seam is not used any more, because it
+    may be wrong there. Links are: without them, a part that returns to a place would fall apart.
+
+    Images of a model with such seams are also removed if their positions are uncertain, see
+    `certain_parts`.
+
+    Args:
+        run: the run.
+        posed: the adjusted poses.
+        image_set: the images.
+        only_certain: remove images with uncertain positions even if there are no such seams.
+
+    Returns:
+        The poses of the largest part. If too few of its images are certain, it is returned with all
+        of them; with `only_certain`, its mapped model then has no images, and the poses of the
+        other stages must not be used.
+    """
+    may_bend = only_certain
+    for number in count(_FIRST_SPLIT):
+        if posed.adjustment is None:
+            break
+        seams, num_images = posed.seams_to_split, posed.adjustment.result.num_registered
+        may_bend |= bool(seams)
+        parts = None
+        if seams:
+            parts = split_stage(
+                run,
+                image_set,
+                posed.mapped,
+                posed.adjustment,
+                seams,
+                rival=posed.rival,
+                number=number,
+            )
+        if parts is None or parts.result.num_registered == num_images:
+            if not may_bend:
+                break
+            seams = []
+            parts = certain_stage(run, image_set, posed.mapped, posed.adjustment, number=number)
+            if parts.result.num_registered == num_images:
+                break
+        if parts.result.num_registered == 0:
+            return replace(posed, mapped=parts) if only_certain else posed
+        frame_of = image_set.images.frame_of
+        frames = [frame_of[first] for first, _ in seams]
+        posed = replace(
+            posed,
+            mapped=parts,
+            tracks=posed.tracks.split_after_frames(frames),
+        )
+        posed = replace(posed, adjustment=_adjusted(run, posed, image_set, parts, number=number))
+        if posed.long_range is not None:
+            posed = replace(posed, long_range=_long_range_check(run, posed, image_set))
+    return posed
