@@ -111,15 +111,33 @@ def markdown(columns: Sequence[Column], rows: Iterable[Row], left: int = 1) -> s
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def measured_at(rows: Sequence[Row], name: str = "") -> str:
-    """A line with the commit and machine of the rows, by the rows' names if they differ."""
-    places: dict[tuple[str, str], list[str]] = {}
+def measured_at(rows: Sequence[Row], name: str = "", way: str = "") -> str:
+    """A line with the commit and machine of the rows, by the rows' names if they differ.
+
+    Args:
+        rows: the rows.
+        name: column of the rows' names.
+        way: another column that is shown where rows of one name differ in their commit.
+    """
+    places: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
-        places.setdefault((row["commit"], row["machine"]), []).append(row.get(name, ""))
+        places.setdefault((row["commit"], row["machine"]), []).append(row)
     if len(places) == 1:
         ((commit, machine),) = places
         return f"Commit {commit}; {machine}.\n"
-    spelled = (f"{', '.join(dict.fromkeys(n))}: commit {c}; {m}" for (c, m), n in places.items())
+
+    def unique(some: Iterable[Row], column: str) -> list[str]:
+        return list(dict.fromkeys(row.get(column, "") for row in some))
+
+    def label(own: Sequence[Row]) -> str:
+        names = unique(own, name)
+        others = unique((row for some in places.values() if some is not own for row in some), name)
+        if not way or set(names).isdisjoint(others):
+            return ", ".join(names)
+        ways = ", ".join(unique(own, way))
+        return ways if set(names) >= set(others) else f"{', '.join(names)} by {ways}"
+
+    spelled = (f"{label(own)}: commit {c}; {m}" for (c, m), own in places.items())
     return ". ".join(spelled) + ".\n"
 
 
@@ -305,7 +323,7 @@ def phone_to_folder(rows: list[Row]) -> str:
             list(ways).index(row["way"]),
         ),
     )
-    return f"{markdown(columns, shown, left=2)}\n{measured_at(shown, 'clip')}"
+    return f"{markdown(columns, shown, left=2)}\n{measured_at(shown, 'clip', 'way')}"
 
 
 def summary(rows: list[Row], *clips: str) -> str:
@@ -348,7 +366,9 @@ def phone_to_folder_steps(rows: list[Row]) -> str:
     ways = dict.fromkeys(row["way"] for row in rows)
     steps = [way for way in ways if way not in _WHOLE and not way.startswith(STAGE)]
     columns = [words("clip", "clip"), *(Column(step, of_step(step)) for step in steps)]
-    return f"{markdown(columns, [{'clip': clip} for clip in clips])}\n{measured_at(rows, 'clip')}"
+    whole = [row for row in rows if not row["way"].startswith(STAGE)]
+    table = markdown(columns, [{"clip": clip} for clip in clips])
+    return f"{table}\n{measured_at(whole, 'clip', 'way')}"
 
 
 _WHOLE = (FROM_FILE, SIFT_FROM_FILE, SIFT_MAP, MATCH_MAP, MATCH_PYCOLMAP, MATCH_COLMAP)
@@ -372,7 +392,7 @@ def phone_to_folder_stages(rows: list[Row]) -> str:
         *(Column(clip, of_clip(clip)) for clip in clips),
     ]
     shown = [{"way": way} for way in (*ways, FROM_STREAM)]
-    return f"{markdown(columns, shown)}\n{measured_at(staged, 'clip')}"
+    return f"{markdown(columns, shown)}\n{measured_at(staged, 'clip', 'way')}"
 
 
 def jerks(rows: list[Row]) -> str:
@@ -439,7 +459,7 @@ def read_motion(rows: list[Row], threads: str) -> str:
         *gain,
         *parse,
     ]
-    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip', 'way')}"
 
 
 def dav1d_profile(rows: list[Row]) -> str:
@@ -450,7 +470,7 @@ def dav1d_profile(rows: list[Row]) -> str:
         *(figure(part, part, ".1f") for part in parts),
         Column("at most", lambda row: f"{100 / (100 - float(row['pictures'])):.2f}"),
     ]
-    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip', 'way')}"
 
 
 def verification(rows: list[Row]) -> str:
@@ -473,7 +493,7 @@ def verification(rows: list[Row]) -> str:
         figure("inliers", "colmap_inliers", ".1%"),
         figure(">= 0.98", "colmap_inliers_of_98", ".1%"),
     ]
-    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip', 'way')}"
 
 
 def encoders(rows: list[Row]) -> str:
@@ -499,7 +519,7 @@ def encoders(rows: list[Row]) -> str:
         figure("ATE", "ate", ".4f"),
         pair("long-range epipolar px", "long_range", "long_range_90", ".2f"),
     ]
-    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip', 'way')}"
 
 
 def rolling_shutter(rows: list[Row]) -> str:
@@ -523,7 +543,7 @@ def rolling_shutter(rows: list[Row]) -> str:
         both("camera centres, mm", "ate_mm", ".1f"),
         both("CPU seconds", "cpu_s", ".1f"),
     ]
-    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip', 'way')}"
 
 
 def movers(rows: list[Row]) -> str:
@@ -583,7 +603,7 @@ def loops(rows: list[Row]) -> str:
         words("false", "far_false"),
         figure("CPU s", "cpu_s", ".0f"),
     ]
-    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip')}"
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'clip', 'way')}"
 
 
 def walks(rows: list[Row]) -> str:
@@ -595,7 +615,7 @@ def walks(rows: list[Row]) -> str:
         words("registered", "registered"),
         words("camera centres", "errors"),
     ]
-    return f"{markdown(columns, rows)}\n{measured_at(rows, 'walk')}"
+    return f"{markdown(columns, rows)}\n{measured_at(rows, 'walk', 'way')}"
 
 
 def one_model(rows: list[Row]) -> str:
@@ -651,7 +671,7 @@ def splats(rows: list[Row]) -> str:
         words("SIFT's PSNR-Y after", "psnr_y_share"),
         words("SIFT's VMAF after", "vmaf_share"),
     ]
-    return f"{markdown(columns, lines)}\n{measured_at(rows, 'clip')}"
+    return f"{markdown(columns, lines)}\n{measured_at(rows, 'clip', 'way')}"
 
 
 def _curves(rows: list[Row]) -> list[Row]:
