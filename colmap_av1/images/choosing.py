@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
-from colmap_av1.images.files import READABLE, grey_within, image_size
+from colmap_av1.images.blur import sharpness_of, skip_blurred
+from colmap_av1.images.files import READABLE, image_size
 from colmap_av1.images.names import (
     check_new_name,
     frames_of_images,
@@ -26,11 +26,11 @@ from colmap_av1.images.names import (
     natural_order,
     pattern_regex,
 )
+from colmap_av1.images.parallax import parallax
 from colmap_av1.images.recognising import check_content, frames_by_content, frames_near
 from colmap_av1.options import ImageOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats, Ints, Picture
-from colmap_av1.util.grouping import grouped
 from colmap_av1.util.texts import read_lines
 
 # Yields (frame number, picture) of some frames, given by their numbers, in order; None: all. Frames
@@ -40,21 +40,6 @@ _Decode = Callable[[Collection[int] | None], Iterable[tuple[int, Picture]]]
 # Added to times in ticks, which are rational numbers. At half the frame rate of a video, every
 # other time lies halfway between two ticks.
 _ROUNDING = 1e-6
-# Longer side in pixels at which sharpness is measured.
-_SHARPNESS_SIZE = 640
-# A frame is blurred if its sharpness is less than this share of the sharpest frame nearby.
-_BLURRED = 0.7
-# Largest distance by which an image may move, as a share of the distance to the next one.
-_REACH = 0.25
-# Focal length assumed for fitting the camera's rotation, in units of the longer side. The remaining
-# motion depends little on it.
-_FOCAL_LENGTH = 1.2
-_IRLS_ITERATIONS = 10
-# Largest number of tracks, spread over the picture, that the rotation is fitted to.
-_MAX_STEPS = 1000
-# Share of the whole motion that is added to parallax: in a flat scene, a rotation explains much of
-# the motion.
-_MOTION_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -169,7 +154,7 @@ def choose_images(
             at = times() if options.fps or options.num_images else None
             frames = choose_frames(num_frames, options, at)
         if folder is not None and options.skip_blurred and (options.fps or options.num_images):
-            frames = skip_blurred(frames, lambda asked: _sharpness(decode(set(asked))))
+            frames = skip_blurred(frames, lambda asked: sharpness_of(decode(set(asked))))
         chosen = ChosenImages(image_names(options.file_name, frames.tolist()), frames)
     if len(chosen.frames) < 2:
         remedy = "add images of other frames" if existing else "choose more frames"
@@ -224,82 +209,6 @@ def spread_in_parallax(tracks: Tracks, num_images: int) -> NDArray[np.int32]:
         int32 frame numbers, strictly ascending.
     """
     return _evenly_spread(np.concatenate([[0.0], np.cumsum(parallax(tracks))]), num_images)
-
-
-def parallax(tracks: Tracks) -> Floats:
-    """Parallax between consecutive pictures: motion that the camera's rotation does not explain.
-
-    The motion field of a rotation (Longuet-Higgins and Prazdny 1980, for a focal length of 1.2
-    times the longer side) is fitted robustly to each pair of neighbouring frames. The parallax is
-    the median of the remaining motion. A tenth of the whole motion is added, since in a flat scene
-    the rotation explains part of the parallax.
-
-    Returns:
-        float64 [num_frames - 1] pixels from each frame to the next, all above 0.
-    """
-    focal = _FOCAL_LENGTH * max(tracks.width, tracks.height)
-    number = tracks.track
-    step = np.flatnonzero((np.diff(number) == 0) & (np.diff(tracks.frame) == 1))
-    order, bounds = grouped(tracks.frame[step], tracks.num_frames)
-    step = step[order]
-    centre = np.array([tracks.width, tracks.height]) / 2
-    found = np.full(max(tracks.num_frames - 1, 0), np.nan)
-    for frame in range(len(found)):
-        steps = step[bounds[frame] : bounds[frame + 1]]
-        if len(steps) < 3:
-            continue
-        steps = steps[:: -(-len(steps) // _MAX_STEPS)]
-        motion = (tracks.xy[steps + 1] - tracks.xy[steps]).astype(np.float64)
-        remains = motion - _rotation_field(tracks.xy[steps] - centre, motion, focal)
-        whole = np.median(np.hypot(motion[:, 0], motion[:, 1]))
-        found[frame] = np.median(np.hypot(remains[:, 0], remains[:, 1])) + _MOTION_SHARE * whole
-    known = np.isfinite(found)
-    # Assume a typical step where no track connects two frames.
-    typical = float(np.median(found[known])) if known.any() else 1.0
-    return np.maximum(np.where(known, found, typical), 1e-6)
-
-
-def skip_blurred(
-    frames: NDArray[np.int32],
-    sharpness: Callable[[Sequence[int]], Floats],
-) -> NDArray[np.int32]:
-    """Replace blurred frames by sharp ones nearby.
-
-    An image moves by at most a quarter of the distance to its neighbours, to the sharpest frame.
-    The first and the last image stay.
-
-    Args:
-        frames: chosen frames, ascending.
-        sharpness: returns the sharpness of frames; called once, with ascending frames.
-
-    Returns:
-        int32 [len(frames)] frames, strictly ascending.
-
-    Raises:
-        ImageError: pictures cannot be decoded.
-    """
-    reach = np.floor(np.diff(frames) * _REACH).astype(np.int64)
-    windows = {
-        k: np.arange(frames[k] - reach[k - 1], frames[k] + reach[k] + 1)
-        for k in range(1, len(frames) - 1)
-        if reach[k - 1] or reach[k]
-    }
-    if not windows:
-        return frames
-    asked = np.unique(np.concatenate(list(windows.values())))
-    values = sharpness(asked.tolist())
-    if len(values) < len(asked):
-        raise ImageError(
-            f"only {len(values)} of {len(asked)} pictures can be decoded to find blurred ones: "
-            "give --skip_blurred 0"
-        )
-    measured = dict(zip(asked.tolist(), values, strict=True))
-    chosen = frames.copy()
-    for k, window in windows.items():
-        sharp = np.array([measured[int(f)] for f in window])
-        if measured[int(frames[k])] < _BLURRED * sharp.max():
-            chosen[k] = window[sharp.argmax()]
-    return np.asarray(chosen, dtype=np.int32)
 
 
 def read_frame_list(
@@ -480,12 +389,6 @@ def _at_steps(names: Sequence[str], num_frames: int, options: ImageOptions) -> N
     return np.array(numbers, dtype=np.int32) * step
 
 
-def _sharpness(pictures: Iterable[tuple[int, Picture]]) -> Floats:
-    """Variance of the Laplacian of pictures, downscaled to reduce noise."""
-    small = (grey_within(picture, _SHARPNESS_SIZE) for _, picture in pictures)
-    return np.array([float(cv2.Laplacian(grey, cv2.CV_32F).var()) for grey in small])
-
-
 def _at_rate(times: Floats, fps: float) -> NDArray[np.int32]:
     """The frames that FFmpeg's fps filter selects: for each tick, the last that rounds to it."""
     half = 0.5 + _ROUNDING
@@ -525,21 +428,3 @@ def _distinct(frames: Ints, count: int) -> NDArray[np.int32]:
     pushed_up = np.maximum.accumulate(frames - index) + index
     most = count - len(frames) + index
     return np.asarray(np.minimum(pushed_up, most), dtype=np.int32)
-
-
-def _rotation_field(xy: Floats, motion: Floats, focal: float) -> Floats:
-    """Motion [n, 2] of the best-fitting rotation at positions [n, 2] from the picture's centre."""
-    x, y = xy[:, 0] / focal, xy[:, 1] / focal
-    columns = np.empty((len(xy), 2, 3))
-    columns[:, 0] = focal * np.stack([x * y, -(1 + x * x), y], axis=1)
-    columns[:, 1] = focal * np.stack([1 + y * y, -x * y, -x], axis=1)
-    weight = np.ones(len(xy))
-    field = np.zeros_like(motion)
-    for _ in range(_IRLS_ITERATIONS):
-        scale = np.sqrt(weight)[:, None]
-        rows = (columns * scale[:, :, None]).reshape(-1, 3)
-        turn = np.linalg.lstsq(rows, (motion * scale).reshape(-1), rcond=None)[0]
-        field = columns @ turn
-        # Weights for least absolute residuals, which are robust to other motion.
-        weight = 1 / np.maximum(np.hypot(*(motion - field).T), 1e-3)
-    return np.asarray(field)

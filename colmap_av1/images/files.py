@@ -27,7 +27,6 @@ from colmap_av1.options.images import check_extension
 from colmap_av1.util.arrays import Picture
 from colmap_av1.util.files import may_read, remove_leftovers, whole_file
 from colmap_av1.util.memory import check_memory
-from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.threads import map_on_threads
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
@@ -37,31 +36,6 @@ from colmap_av1.video.unchanged import unchanged
 
 # Extensions of images that can be read.
 READABLE = {*WRITE_PARAMETERS, ".bmp", ".tif", ".tiff"}
-# Longer side in pixels at which detail is measured. Larger pictures are often soft at full size,
-# which does no harm.
-_DETAIL_SIZE = 960
-# A pixel has detail if its grey value changes by more than this when the picture is halved and
-# enlarged again. 2 to 30 % of the pixels of sharp videos have detail, and at most two in ten
-# thousand after a Gaussian blur of 2.5 to 12 px. Images with less than the second share are
-# blurred.
-_VISIBLE = 8.0
-_MIN_DETAIL = 0.005
-# Second differences of grey values along rows, columns and both diagonals. Motion blur leaves
-# detail only across its direction. In sharp videos, the poorest direction has at least 12 % of the
-# detail of the richest; after a blur along a line of 9 px at most 3 %, of 25 to 80 px 0.5 %, even
-# with noise of 3 grey levels.
-_SECOND_DIFFERENCES = tuple(
-    np.array(kernel, np.float32) / 4
-    for kernel in (
-        [[0, 0, 0], [-1, 2, -1], [0, 0, 0]],
-        [[0, -1, 0], [0, 2, 0], [0, -1, 0]],
-        [[-1, 0, 0], [0, 2, 0], [0, 0, -1]],
-        [[0, 0, -1], [0, 2, 0], [-1, 0, 0]],
-    )
-)
-_MIN_OF_RICHEST = 0.02
-# Number of images of a video in which detail is measured.
-_NUM_MEASURED = 5
 
 
 def size_of_images(
@@ -352,47 +326,6 @@ def read_image(path: Path) -> Picture:
         what = "is not an image that OpenCV reads" if data else "is missing or empty"
         raise ImageError(f"{path}: {what}: give the folder of the images")
     return np.asarray(image, dtype=np.uint8)
-
-
-def blur_warning(files: Sequence[Path]) -> str | None:
-    """Warning if the images are blurred, measured in a few of them.
-
-    Raises:
-        ImageError: an image is missing or cannot be read.
-    """
-    some = [files[i] for i in evenly_spread(len(files), _NUM_MEASURED, rounded=True)]
-    greys = [grey_within(read_image(file), _DETAIL_SIZE) for file in some]
-    if float(np.median([_detail(grey) for grey in greys])) < _MIN_DETAIL:
-        return (
-            f"{files[0].parent}: the images are blurred, dark or lack texture; half their size "
-            "would show as much: their tracks are few and inaccurate; film in focus, in good light "
-            "and more slowly"
-        )
-    directions = np.median([_detail_by_direction(grey) for grey in greys], axis=0)
-    if directions.min() < _MIN_OF_RICHEST * directions.max():
-        return (
-            f"{files[0].parent}: the images are blurred in one direction, as by camera motion: "
-            "their tracks are few and inaccurate; film more slowly, or in more light, which "
-            "shortens the exposure"
-        )
-    return None
-
-
-def _detail(grey: Picture) -> float:
-    """Share of the pixels that have detail."""
-    height, width = grey.shape
-    half = (max(1, width // 2), max(1, height // 2))
-    small = cv2.resize(grey, half, interpolation=cv2.INTER_AREA)
-    again = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
-    return float(np.mean(cv2.absdiff(grey, again) > _VISIBLE))
-
-
-def _detail_by_direction(grey: Picture) -> list[float]:
-    """Share of the pixels that have detail along rows, columns and both diagonals."""
-    return [
-        float(np.mean(np.abs(cv2.filter2D(grey, cv2.CV_32F, kernel)) > _VISIBLE))
-        for kernel in _SECOND_DIFFERENCES
-    ]
 
 
 def grey_within(picture: Picture, longest: int) -> Picture:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_av1.geometry.cameras import make_camera
+from colmap_av1.images.blur import blur_warning
 from colmap_av1.images.choosing import check_frame_list, existing_images
 from colmap_av1.images.files import (
-    blur_warning,
     check_image_folder,
     check_images_there,
     has_shape,

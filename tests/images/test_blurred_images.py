@@ -10,7 +10,7 @@ import pytest
 from conftest import PROJECT, QUICK_AV1, SHARED, Encode
 from numpy.typing import NDArray
 
-from colmap_av1.images.files import blur_warning
+from colmap_av1.images.blur import blur_warning
 from colmap_av1.match import match
 from colmap_av1.options import ImageOptions, MatchOptions
 from colmap_av1.video.decoding import decode_frames

@@ -16,14 +16,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from colmap_av1.errors import ImageError, OptionError
+from colmap_av1.images.blur import skip_blurred
 from colmap_av1.images.choosing import (
     choose_frames,
     choose_images,
-    parallax,
     read_frame_list,
-    skip_blurred,
     spread_in_parallax,
 )
+from colmap_av1.images.parallax import parallax
 from colmap_av1.match import MatchReport, match
 from colmap_av1.motion.reading import frame_times
 from colmap_av1.options import DensityOptions, ImageOptions, MatchOptions, VerifyOptions
