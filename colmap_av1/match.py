@@ -32,7 +32,6 @@ from colmap_av1.images.track_images import MIN_IMAGES
 from colmap_av1.matching.cameras import ImageCameras, new_cameras
 from colmap_av1.matching.few_matches import matching_warning
 from colmap_av1.matching.gaps import fast_frames
-from colmap_av1.matching.image_matches import PairedImages
 from colmap_av1.matching.initial_pairs import prepare_start
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.mapper_limits import FORWARD_MOTION, SMALL_ANGLES
@@ -41,6 +40,7 @@ from colmap_av1.matching.match_images import (
     SelectedTracks,
     match_images,
 )
+from colmap_av1.matching.matched_images import PairedImages
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter
 from colmap_av1.options import (
     DensifyOptions,

@@ -23,7 +23,7 @@ from colmap_av1.database.reading import (
     pair_id_from_image_ids,
 )
 from colmap_av1.errors import DatabaseError
-from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import OnExisting

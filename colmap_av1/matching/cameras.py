@@ -19,7 +19,7 @@ from colmap_av1.geometry.cameras import (
 from colmap_av1.images.image_set import ImageSet, ShownVideo
 from colmap_av1.images.photos import Photo
 from colmap_av1.matching.focal import estimate_focal_length
-from colmap_av1.matching.image_matches import PairedImages
+from colmap_av1.matching.matched_images import PairedImages
 from colmap_av1.options import CameraOptions
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.metadata.lens import container_focal_length

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.util.arrays import Floats
 
 # Focal lengths to try, in units of the longer image side. With longer ones, a rotation looks like

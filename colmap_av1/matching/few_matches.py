@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.names import natural_order
 from colmap_av1.matching.gaps import Gap
-from colmap_av1.matching.image_matches import MatchedImages, used_pairs
+from colmap_av1.matching.matched_images import MatchedImages, used_pairs
 from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.util.grouping import sums_beside_gaps
 

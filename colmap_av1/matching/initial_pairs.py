@@ -11,7 +11,6 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.matching.growth import Growth
-from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pair_trial import try_initial_pair
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
@@ -24,6 +23,7 @@ from colmap_av1.matching.mapper_limits import (
     SMALL_ANGLES,
     InitialLimits,
 )
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pair_poses import (
     contradicted_angle,
     is_wrong_rotation,

@@ -14,15 +14,15 @@ from colmap_av1.images.image_set import ImageSet, Pictures
 from colmap_av1.matching.cameras import ImageCameras
 from colmap_av1.matching.depth import DepthEvidence, depth_of_images
 from colmap_av1.matching.gaps import should_examine_pictures
-from colmap_av1.matching.image_matches import (
+from colmap_av1.matching.links.link_images import link_images
+from colmap_av1.matching.links.report import LinkReport
+from colmap_av1.matching.matched_images import (
     MatchedImages,
     PairedImages,
     join_videos,
     pair_images,
     verify_images,
 )
-from colmap_av1.matching.links.link_images import link_images
-from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.util.arrays import Bools, Ints

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pycolmap
 
-from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewGeometry
 from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.util.arrays import Floats

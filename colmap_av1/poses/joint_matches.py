@@ -20,9 +20,9 @@ from colmap_av1.errors import ModelError
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, reprojection_errors
 from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.matching.image_matches import PairedImages, verify_images
 from colmap_av1.matching.mapper_limits import POINT_MIN_ANGLE
 from colmap_av1.matching.match_images import ImageMatches
+from colmap_av1.matching.matched_images import PairedImages, verify_images
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.adjustment_stage import AdjustedResult

@@ -36,7 +36,7 @@ from colmap_av1.geometry.posed_model import (
 )
 from colmap_av1.geometry.track_points import seen_in, to_model_points
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.matching.image_matches import verify_images
+from colmap_av1.matching.matched_images import verify_images
 from colmap_av1.matching.pairs import covisible_pairs
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.adjusting import adjust_posed, mean_cost, refines_intrinsics

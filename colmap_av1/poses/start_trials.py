@@ -17,9 +17,9 @@ import pycolmap
 
 from colmap_av1.database.writing import write_matches
 from colmap_av1.geometry.cameras import with_known_focal_lengths
-from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pairs import PreparedStart, are_far, with_demoted
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
 from colmap_av1.util.arrays import Bools

@@ -11,7 +11,7 @@ from colmap_av1.geometry.cameras import largest_size
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.geometry.track_points import tracks_of_points
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.matching.image_matches import PairedImages
+from colmap_av1.matching.matched_images import PairedImages
 from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Ints

@@ -31,7 +31,7 @@ from colmap_av1.database.reading import pair_id_from_image_ids
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.options import CameraOptions
 
 

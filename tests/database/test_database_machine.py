@@ -28,7 +28,7 @@ from colmap_av1.database.reading import read_cameras, read_images
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import ColmapAv1Error
 from colmap_av1.interop.hloc import export_hloc
-from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.view import view_database

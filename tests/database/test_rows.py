@@ -38,7 +38,7 @@ from colmap_av1.database.reading import (
 from colmap_av1.database.writing import check_writable, write_matches
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import CameraOptions

@@ -37,7 +37,7 @@ from synthetic_scene import HEIGHT, WIDTH, alignment_error
 from colmap_av1.database.reading import pair_id_from_image_ids, read_images
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import DatabaseError
-from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import OnExisting

@@ -14,9 +14,9 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, make_scene, match_scen
 from colmap_av1.database.writing import write_matches
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.growth import Growth
-from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pairs import prepare_start
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS, SMALL_ANGLES
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.options import CameraOptions
 from colmap_av1.util.progress import Clock
 

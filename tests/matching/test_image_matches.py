@@ -12,7 +12,7 @@ from colmap_av1.errors import VideoError
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.matching.cameras import shared_focal_length
-from colmap_av1.matching.image_matches import PairedImages, pair_images, verify_images
+from colmap_av1.matching.matched_images import PairedImages, pair_images, verify_images
 from colmap_av1.options import CameraOptions, PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.run_context import RunContext

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pairs import prepare_start
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
@@ -20,6 +19,7 @@ from colmap_av1.matching.mapper_limits import (
     SMALL_ANGLES,
     InitialLimits,
 )
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.verify import verify_pairs

@@ -28,9 +28,9 @@ from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.match import MatchReport, match
 from colmap_av1.matching.features.retrieval import similar_images
 from colmap_av1.matching.features.sift import Features, extract_features, match_features
-from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.links.matching import Links
 from colmap_av1.matching.links.merging import links_as_tracks, merge_links
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.options import (

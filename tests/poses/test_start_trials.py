@@ -13,9 +13,9 @@ from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH, make_scene, match_scen
 
 from colmap_av1.database.writing import write_matches
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.initial_pairs import PreparedStart
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS, INITIAL_MIN_INLIERS
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import CameraOptions

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pairs import image_keypoints, pair_matches, schedule_pairs
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import PairOptions, VerifyOptions

@@ -10,7 +10,7 @@ from colmap_av1.errors import VideoError
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.choosing import existing_images
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_prepared
-from colmap_av1.matching.image_matches import pair_images, verify_images
+from colmap_av1.matching.matched_images import pair_images, verify_images
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,

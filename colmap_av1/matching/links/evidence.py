@@ -11,9 +11,9 @@ import pycolmap
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.features.sift import Features
 from colmap_av1.matching.gaps import Gap, GapReason, SuspectGaps
-from colmap_av1.matching.image_matches import MatchedImages, connected_images
 from colmap_av1.matching.links.matching import Links
 from colmap_av1.matching.links.report import LinkReport
+from colmap_av1.matching.matched_images import MatchedImages, connected_images
 from colmap_av1.matching.verify import agreeing_matches
 from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.graphs import connected_components

@@ -24,7 +24,6 @@ from colmap_av1.images.image_set import ImageSet, Pictures
 from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.sift import Features
 from colmap_av1.matching.gaps import suspect_gaps
-from colmap_av1.matching.image_matches import MatchedImages, nothing_to_match
 from colmap_av1.matching.links.evidence import (
     confirmed_gaps,
     contradicted_gaps,
@@ -51,6 +50,7 @@ from colmap_av1.matching.links.plan import (
     thorough_plan,
 )
 from colmap_av1.matching.links.report import LinkReport
+from colmap_av1.matching.matched_images import MatchedImages, nothing_to_match
 from colmap_av1.options import LinkOptions, PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools

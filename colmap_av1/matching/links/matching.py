@@ -19,8 +19,8 @@ from colmap_av1.matching.features.sift import (
     masked_features,
     match_features,
 )
-from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.links.plan import reach
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import TwoViewGeometry
 from colmap_av1.matching.verify import verify_pairs

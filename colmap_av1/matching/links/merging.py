@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.matching.features.sift import Features
-from colmap_av1.matching.image_matches import MatchedImages
 from colmap_av1.matching.links.matching import Links
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints, next_track
 from colmap_av1.matching.two_view_geometry import TwoViewConfig, TwoViewGeometry
 from colmap_av1.tracks.tracks import Tracks

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.gaps import SuspectGaps, low_inter_gaps, probed_gaps
-from colmap_av1.matching.image_matches import MatchedImages
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.options import LinkOptions
 from colmap_av1.util.arrays import Bools, Ints
 
