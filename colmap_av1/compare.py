@@ -100,8 +100,9 @@ def compare(
         VideoError: the video cannot be read.
         BitstreamError: the stream is damaged, and `strict` is set or the damage is before the
             second frame.
-        ImageError: images cannot be chosen or written, or do not match the reference.
+        ImageError: images cannot be chosen, or do not match the reference.
         ModelError: the reference is not a readable model, or has poses of fewer than 3 images.
+        WriteError: the output cannot be written.
         OptionError: a front-end is unknown, or the folder has other content.
         EvaluationError: a package is missing that the report, a front-end or the trainer needs.
     """

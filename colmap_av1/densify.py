@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np  # noqa: F401 - before pycolmap: else writing PNG files fails later
 import pycolmap
 
 from colmap_av1.errors import ModelError, writing

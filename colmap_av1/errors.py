@@ -44,7 +44,7 @@ class HlocError(ColmapAv1Error):
 
 
 class EncodeError(ColmapAv1Error):
-    """No AV1 encoder works, or it fails."""
+    """No AV1 encoder works, it fails, or there is no place for the stream."""
 
 
 class ModelError(ColmapAv1Error):

@@ -241,6 +241,7 @@ def match(
         ImageError: images or names do not match the video, or a photo cannot be read.
         DatabaseError: the database is locked, is not a COLMAP database, does not match the video,
             or has features of its images, which `options.on_existing` does not allow.
+        WriteError: an image or a converted stream cannot be written.
         OptionError: an option conflicts with the videos, their images or another option.
 
     Examples:

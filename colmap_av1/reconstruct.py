@@ -198,7 +198,7 @@ def reconstruct(
         VideoError: a video cannot be read, or has no motion to match.
         BitstreamError: a stream is damaged, and `strict` is set or the damage is before the
             second frame.
-        ImageError: images cannot be chosen or written.
+        ImageError: images cannot be chosen.
         ModelError: no poses are found.
         WriteError: the output cannot be written.
         OptionError: an option does not fit the video, the folder has other contents, or the file

@@ -180,12 +180,12 @@ def run_batch(
                 on_progress(counts, row)
                 before = time.monotonic()
                 if before >= next_time:
-                    with suppress(OptionError):
+                    with suppress(WriteError):
                         _write_rows(into, shard, rows, facts, earlier)
                     after = time.monotonic()
                     next_time = after + max(_WRITE_EVERY, (after - before) / _WRITE_SHARE)
         except BaseException:
-            with suppress(OptionError):
+            with suppress(WriteError):
                 _write_rows(into, shard, rows, facts, earlier)
             raise
         _write_rows(into, shard, rows, facts)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_av1.cli.terminal import renamed
-from colmap_av1.errors import OptionError, writing
+from colmap_av1.errors import OptionError, WriteError, writing
 from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.files import check_creatable, whole_file
 from colmap_av1.util.plain import plain
@@ -57,7 +57,7 @@ def failure_as_json(namespace: argparse.Namespace) -> Iterator[None]:
             from colmap_av1.util.failures import failure_of
 
             failure = dataclasses.asdict(failure_of(error))
-            with suppress(OptionError):  # the error itself is reported in any case
+            with suppress(WriteError):  # the error itself is reported in any case
                 _write(path, {"failure": failure, "cpu_seconds": cpu_seconds()})
         raise
 

@@ -78,14 +78,19 @@ def posed_images(reconstruction: pycolmap.Reconstruction) -> dict[str, ModelImag
 
 def point_positions(reconstruction: pycolmap.Reconstruction) -> Floats:
     """The points of a pycolmap.Reconstruction: float64 [n, 3], in the order of their ids."""
-    xyz = [reconstruction.points3D[i].xyz for i in sorted(reconstruction.points3D)]
+    xyz = [point.xyz for point in _points(reconstruction)]
     return np.array(xyz, dtype=np.float64).reshape(-1, 3)
 
 
 def point_colours(reconstruction: pycolmap.Reconstruction) -> NDArray[np.uint8]:
     """The colours of these points: uint8 [n, 3] RGB, in the order of their ids."""
-    rgb = [reconstruction.points3D[i].color for i in sorted(reconstruction.points3D)]
+    rgb = [point.color for point in _points(reconstruction)]
     return np.array(rgb, dtype=np.uint8).reshape(-1, 3)
+
+
+def _points(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Point3D]:
+    every = reconstruction.points3D
+    return [every[i] for i in sorted(every)]
 
 
 def model_points(
@@ -102,7 +107,7 @@ def model_points(
         i: np.array([p.xy for p in reconstruction.images[i].points2D], dtype=np.float64)
         for i in index
     }
-    points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
+    points = _points(reconstruction)
     own = [[e for e in p.track.elements if int(e.image_id) in index] for p in points]
     seen = [element for elements in own for element in elements]
     return ModelPoints(

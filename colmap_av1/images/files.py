@@ -233,12 +233,8 @@ def write_images(
     parents = {path.parent for path in wanted.values()}
     made = [parent for parent in parents if not parent.exists()]
     for parent in parents:
-        try:
+        with writing(parent):
             parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ImageError(
-                f"{parent}: cannot be created: {error.strerror}: fix that, or give another path"
-            ) from error
         remove_leftovers(parent)
     try:
         video = read_video(video, operating_point)

@@ -71,16 +71,16 @@ _NO_LINKS = _FurtherLinks()
 
 
 class _Last(Generic[_Value]):
-    """The last result of a function; freed before the next is made, because estimates are large."""
+    """The last result of a kind; freed before the next is made, because estimates are large."""
 
-    def __init__(self, make: Callable[..., _Value]) -> None:
-        self._make = make
+    def __init__(self) -> None:
         self._made: tuple[tuple[Any, ...], _Value] | None = None
 
-    def __call__(self, *given: Any) -> _Value:
-        if self._made is None or self._made[0] != given:
+    def get(self, key: tuple[Any, ...], make: Callable[[], _Value]) -> _Value:
+        """The last result if it has the same key, else a new one."""
+        if self._made is None or self._made[0] != key:
             self._made = None
-            self._made = given, self._make(*given)
+            self._made = key, make()
         return self._made[1]
 
 
@@ -105,18 +105,39 @@ class _Estimates:
     Attributes:
         run: the run.
         image_set: the images.
-        mapped: the mapper's models of the key images, given the links.
-        whole: the adjusted poses, given the links and the file of the mapper's model, None for the
-            largest.
-        split: likewise, split at doubtful seams.
     """
 
     def __init__(self, run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> None:
         self.run, self.image_set = run, image_set
         self._videos = videos
-        self.mapped = _Last[Mapped](self._map)
-        self.whole = _Last[Posed](self._pose)
-        self.split = _Last[Posed](self._split)
+        self._mapped, self._whole, self._split = _Last[Mapped](), _Last[Posed](), _Last[Posed]()
+
+    def mapped(self, links: _FurtherLinks) -> Mapped:
+        """The mapper's models of the key images."""
+        run = self._run(links)
+
+        def make() -> Mapped:
+            return map_key_images(run, self._videos, self.image_set, doubted=links.doubted)
+
+        return self._mapped.get((links,), make)
+
+    def whole(self, links: _FurtherLinks, first: str | None) -> Posed:
+        """The adjusted poses of one of these models, given by its file; None: the largest."""
+        run = self._run(links)
+
+        def make() -> Posed:
+            return pose_images(run, self._videos, self.image_set, self.mapped(links), first)
+
+        return self._whole.get((links, first), make)
+
+    def split(self, links: _FurtherLinks, first: str | None) -> Posed:
+        """These poses, split at doubtful seams."""
+        run = self._run(links)
+
+        def make() -> Posed:
+            return split_at_seams(run, self.whole(links, first), self.image_set)
+
+        return self._split.get((links, first), make)
 
     def outcome(self, links: _FurtherLinks, first: str | None = None) -> _Outcome:
         """What the estimate shows after it is split."""
@@ -132,17 +153,6 @@ class _Estimates:
         if links.none:
             return _with_links(self.run, "none")
         return _with_links(self.run, "sift") if links.loops else self.run
-
-    def _map(self, links: _FurtherLinks) -> Mapped:
-        run = self._run(links)
-        return map_key_images(run, self._videos, self.image_set, doubted=links.doubted)
-
-    def _pose(self, links: _FurtherLinks, first: str | None) -> Posed:
-        run, mapped = self._run(links), self.mapped(links)
-        return pose_images(run, self._videos, self.image_set, mapped, first)
-
-    def _split(self, links: _FurtherLinks, first: str | None) -> Posed:
-        return split_at_seams(self._run(links), self.whole(links, first), self.image_set)
 
 
 def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> Posed:

@@ -347,6 +347,7 @@ def split_at_seams(
                 posed.mapped,
                 posed.adjustment,
                 seams,
+                tracks=posed.tracks,
                 rival=posed.rival,
                 number=number,
             )

@@ -152,7 +152,7 @@ class Tracks:
         *,
         min_length: int,
     ) -> Tracks:
-        """Make other tracks of the same video from their observations.
+        """Make other tracks through frames of the same number and size from their observations.
 
         Args:
             track: integers [n] number of the track of each observation. A track is observed at most
@@ -369,7 +369,8 @@ class Tracks:
 
         Args:
             kept: bool [num_observations] which are kept, or int64 [n] their indices.
-            offsets: see `Tracks`.
+            offsets: int64 [num_tracks + 1] index of the first kept observation of each track, and
+                the number of kept observations.
         """
         # A position is indexed as one number of eight bytes: rows of two numbers take several times
         # as long.

@@ -132,7 +132,7 @@ def measured_at(rows: Sequence[Row], name: str = "", way: str = "") -> str:
     def label(own: Sequence[Row]) -> str:
         names = unique(own, name)
         others = unique((row for some in places.values() if some is not own for row in some), name)
-        if not way or set(names).isdisjoint(others):
+        if not own[0].get(way) or set(names).isdisjoint(others):
             return ", ".join(names)
         ways = ", ".join(unique(own, way))
         return ways if set(names) >= set(others) else f"{', '.join(names)} by {ways}"

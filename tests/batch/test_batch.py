@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -28,6 +29,7 @@ from colmap_av1 import (
     run_batch,
     write_page,
 )
+from colmap_av1.batch.output import Output
 from colmap_av1.batch.run import Counts
 from colmap_av1.cli import main
 from colmap_av1.errors import ColmapAv1Error, WriteError
@@ -236,8 +238,25 @@ def test_folder_that_cannot_be_created_fails_only_its_video(clips: Path, tmp_pat
     (out / "a").write_text("a file")
     report = run_batch(videos, out, ReadOptions(), options=ONCE)
     assert (report.num_done, report.failed) == (1, {"reading or writing": 1})
-    with pytest.raises(WriteError, match="written"):
+    with pytest.raises(WriteError, match="cannot be written"):
         run_batch(videos, out / "a", ReadOptions())
+
+
+def test_rows_that_cannot_be_written_during_a_run_are_written_at_its_end(
+    clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, refused = Output.write, list[str]()
+
+    def write_later(self: Output, path: str, content: bytes) -> None:
+        if path.endswith(".csv") and not refused:
+            refused.append(path)
+            raise OSError(errno.ENOSPC, "No space left on device", path)
+        write(self, path, content)
+
+    monkeypatch.setattr(Output, "write", write_later)
+    report = run_batch(clips / "a", tmp_path / "out", ReadOptions(), options=ONCE)
+    assert refused
+    assert len(rows_of(tmp_path / "out")) == report.num_videos
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not allow such names")

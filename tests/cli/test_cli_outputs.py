@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import os
 import shutil
@@ -15,6 +16,8 @@ import pytest
 from killed_runs import kill_while_replacing
 
 from colmap_av1.cli import main
+from colmap_av1.cli.report_file import failure_as_json
+from colmap_av1.errors import VideoError
 
 
 @pytest.fixture(scope="module")
@@ -213,3 +216,18 @@ def test_half_replaced_model_is_restored_by_a_failing_run(steps: int, work: Path
     hidden = [name for name in left if name.startswith(".")]
     assert hidden == []
     assert contents(work / "model") == before or set(os.listdir(work / "model")) == {"a", "c"}
+
+
+def test_an_error_is_reported_even_if_its_report_cannot_be_written(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    namespace = argparse.Namespace(report_json=str(folder / "report.json"))
+
+    def fail() -> None:
+        with failure_as_json(namespace):
+            folder.rmdir()
+            folder.touch()
+            raise VideoError("the reason")
+
+    with pytest.raises(VideoError, match="reason"):
+        fail()

@@ -289,7 +289,7 @@ def test_failures_leave_nothing(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(DatabaseError, match="no such file"):
         export_hloc(tmp_path / "none.db", tmp_path / "h")
-    with pytest.raises(WriteError, match="written"):
+    with pytest.raises(WriteError, match="cannot be written"):
         export_hloc(tmp_path / "a.db", tmp_path / "file")
     with pytest.raises(DatabaseError, match="no keypoints"):
         export_hloc(tmp_path / "a.db", tmp_path / "h")

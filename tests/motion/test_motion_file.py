@@ -64,8 +64,8 @@ def test_failures_leave_nothing(clip: Path, tmp_path: Path) -> None:
         export_motion(clip, tmp_path / "m.txt")
     with pytest.raises(VideoError, match="no such file"):
         export_motion(tmp_path / "none.mp4", tmp_path / "m.npz")
-    with pytest.raises(WriteError, match="written"):
+    with pytest.raises(WriteError, match="cannot be written"):
         export_motion(clip, tmp_path / "absent/m.npz")
-    with pytest.raises(WriteError, match="written"):
+    with pytest.raises(WriteError, match="cannot be written"):
         export_motion(clip, tmp_path / "absent/m.h5")
     assert list(tmp_path.iterdir()) == []
