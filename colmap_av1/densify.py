@@ -248,12 +248,14 @@ def _track(
         found = track_chosen_images(
             source,
             replace(matching.tracking, tracks=chaining),
-            ImageChoice(matching.images, images.names, images.folder, of_model=True),
+            ImageChoice(
+                matching.images, images.names, images.folder, images.shown.display, of_model=True
+            ),
             masks=images.masks,
             every_frame=False,
             context=context,
         )
-    tracks = found.tracks.keep_frames(found.chosen.frames).scale_to(images.size)
+    tracks = found.tracks.keep_frames(found.chosen.frames).scale_to(images.shown.size)
     return found.with_tracks(tracks), source.conversion
 
 
@@ -266,8 +268,12 @@ def _pictures(
 ) -> Pictures:
     """A source of pictures in the size of the images; those of videos are kept in a folder."""
     shown = [
-        replace(
-            ShownVideo.as_played(own.video, KeptPictures(scratch / f"{number}.raw")), size=own.size
+        ShownVideo(
+            own.video,
+            own.shown.size,
+            own.shown.pixel_aspect,
+            own.shown.display,
+            KeptPictures(scratch / f"{number}.raw"),
         )
         for number, own in enumerate(of_videos)
     ]

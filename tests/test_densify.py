@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 import render_scene
+from conftest import Ffmpeg
 from dense_scene import SCENE, Truth
 
 from colmap_av1.densify import densify
@@ -89,6 +90,25 @@ def test_list_of_frames_may_have_images_that_the_model_lacks(truth: Truth, tmp_p
     listed.write_text("0 0000.png\n4 0004.png\n")
     with pytest.raises(ImageError, match="list"):
         densify(model, SCENE, tmp_path / "few", options=options)
+
+
+def test_images_may_be_stored_without_the_rotation_of_the_video(
+    truth: Truth, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    turned = ffmpeg(*("-display_rotation", "90", "-i", SCENE, "-c", "copy"), tmp_path / "t.mp4")
+    model = true_model(tmp_path / "model", truth, range(0, 40, 4))
+    options = DensifyOptions(
+        match=MatchOptions(images=ImageOptions(first_number=0)),
+        triangulate=TriangulateOptions(points="survey"),
+    )
+    upright = densify(model, SCENE, tmp_path / "upright", options=options)
+    report = densify(model, turned, tmp_path / "turned", options=options)
+    assert report.num_points == upright.num_points > 0
+    colours = [
+        [point.color.tolist() for point in pycolmap.Reconstruction(own.output).points3D.values()]
+        for own in (report, upright)
+    ]
+    assert colours[0] == colours[1]
 
 
 def test_points_lie_on_the_surfaces(truth: Truth, dense: pycolmap.Reconstruction) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.images.blur import sharpness_of, skip_blurred
-from colmap_av1.images.files import READABLE, image_size
+from colmap_av1.images.files import READABLE, UNREADABLE, image_size
 from colmap_av1.images.names import (
     check_new_name,
     frames_of_images,
@@ -31,7 +32,7 @@ from colmap_av1.images.recognising import check_content, frames_by_content, fram
 from colmap_av1.options import ImageOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats, Ints, Picture
-from colmap_av1.util.texts import read_lines
+from colmap_av1.util.texts import read_lines, some_names
 
 # Yields (frame number, picture) of some frames, given by their numbers, in order; None: all. Frames
 # are numbered as players show them, from 0.
@@ -40,6 +41,8 @@ _Decode = Callable[[Collection[int] | None], Iterable[tuple[int, Picture]]]
 # Added to times in ticks, which are rational numbers. At half the frame rate of a video, every
 # other time lies halfway between two ticks.
 _ROUNDING = 1e-6
+# A line of a list of frames that begins with an index.
+_INDEXED = re.compile(r"(\d+)(?:[\s,]+(.*))?")
 
 
 @dataclass(frozen=True)
@@ -90,14 +93,17 @@ def existing_images(
     root = Path(folder)
     if not root.is_dir():
         return []
-    found = [
-        p.name
-        for p in root.iterdir()
-        if p.suffix.lower() in READABLE and not p.name.startswith(".")
-    ]
-    names = sorted(found, key=natural_key)
+    found = [p for p in root.iterdir() if not p.name.startswith(".")]
+    unread = sorted(p.name for p in found if p.suffix.lower() in UNREADABLE)
+    if unread:
+        warnings.warn(
+            f"{root}: ignored {len(unread)} images: convert these to JPEG or PNG: "
+            f"{some_names(unread)}",
+            stacklevel=2,
+        )
+    names = sorted((p.name for p in found if p.suffix.lower() in READABLE), key=natural_key)
     is_own = image_names(options.file_name, [0])[0] in names
-    if options.fps is not None or options.num_images is not None:
+    if options.is_spread:
         regex = pattern_regex(options.file_name)
         are_new = all(regex.fullmatch(name) for name in names)
         is_own |= are_new and names != image_names(options.file_name, range(1, len(names) + 1))
@@ -121,9 +127,10 @@ def choose_images(
     """Choose the frames that become images: the frames of existing images, else by the options.
 
     The frames of existing images are determined by `frame_list`; by `every`, in the order of their
-    names from frame 0, or with `first_number` by the numbers in their names; or by count and names,
-    see `frames_of_images`. If these are ambiguous or wrong, and the files exist, the frames are
-    found by content.
+    names from frame 0, or with `first_number` by the numbers in their names; by `num_images` or
+    `fps`, if these choose exactly the existing images; or by count and names, see
+    `frames_of_images`. If these are ambiguous or wrong, and the files exist, the frames are found
+    by content.
 
     Args:
         num_frames: number of frames of the video.
@@ -134,14 +141,15 @@ def choose_images(
         decode: yields (frame number, picture) of some frames, given by their numbers, or with
             None of all frames.
         tracks: tracks through all frames if new images are spread in parallax; else None.
-        of_model: the existing images are those of a model, so `frame_list` may list more.
+        of_model: the existing images are those of a model, so the options may choose more.
 
     Raises:
         ImageError: the frames of the existing images cannot be determined, or fewer than two are
             chosen.
-        OptionError: an option does not apply to existing images, or `fps` needs times.
+        OptionError: `num_images` or `fps` chooses other images than those that exist, or `fps`
+            needs times.
     """
-    if existing:
+    if existing and not options.is_spread:
         chosen = _find_existing(num_frames, options, existing, folder, decode, of_model=of_model)
     elif options.frame_list is not None:
         chosen = read_frame_list(options.frame_list, num_frames, options)
@@ -151,11 +159,19 @@ def choose_images(
         if tracks is not None and options.num_images is not None:
             frames = spread_in_parallax(tracks, options.num_images)
         else:
-            at = times() if options.fps or options.num_images else None
+            at = times() if options.is_spread else None
             frames = choose_frames(num_frames, options, at)
-        if folder is not None and options.skip_blurred and (options.fps or options.num_images):
+        if folder is not None and options.skip_blurred and options.is_spread:
             frames = skip_blurred(frames, lambda asked: sharpness_of(decode(set(asked))))
         chosen = ChosenImages(image_names(options.file_name, frames.tolist()), frames)
+        if existing and of_model:
+            chosen = _keep_images_of_model(chosen, existing)
+        if existing and {*existing} != {*chosen.names}:
+            way = "num_images" if options.fps is None else "fps"
+            raise OptionError(
+                f"{way} chooses other images than the {len(existing)} that exist: leave it out, or "
+                "give a new database and folder"
+            )
     if len(chosen.frames) < 2:
         remedy = "add images of other frames" if existing else "choose more frames"
         if num_frames < 2:
@@ -216,9 +232,9 @@ def read_frame_list(
 ) -> ChosenImages:
     """Read which frames become images, and their names, from a text file.
 
-    A line holds the index of a frame, from 0, optionally followed by the name of the image; or only
-    a name, whose last number is that of the frame, counted from `first_number` (0 if None). Empty
-    lines and lines that start with '#' are ignored.
+    A line holds the index of a frame, from 0, optionally followed by a space or comma and the name
+    of the image; or only a name, whose last number is that of the frame, counted from
+    `first_number` (0 if None). Empty lines and lines that start with '#' are ignored.
 
     Raises:
         ImageError: the file is missing, or lists a frame that the video does not have, or a frame
@@ -259,17 +275,17 @@ def _read_entries(
             "frame's index on each line"
         ) from error
     entries: list[tuple[int, int, str]] = []
-    for number, line in enumerate(lines, start=1):
-        words = line.split(maxsplit=1)
-        if not words or words[0].startswith("#"):
+    for number, line in enumerate(map(str.strip, lines), start=1):
+        if not line or line.startswith("#"):
             continue
-        if words[0].isdecimal():
-            frame = last_number(words[0]) or 0
-            name = words[1].strip() if len(words) == 2 else options.file_name % frame
+        indexed = _INDEXED.fullmatch(line)
+        if indexed is not None:
+            frame = last_number(indexed[1]) or 0
+            name = indexed[2] or options.file_name % frame
         else:
-            name = line.strip()
+            name = line
             found, extension = last_number(name), PurePosixPath(name).suffix[1:]
-            if found is None or not extension or extension.isdecimal():
+            if found is None or not extension.isalnum() or extension.isdecimal():
                 raise ImageError(
                     f"{path}, line {number}: '{name}' is neither the index of a frame nor the name "
                     "of an image with a number"
@@ -298,20 +314,14 @@ def _find_existing(
     of_model: bool,
 ) -> ChosenImages:
     """Find the frames of existing images."""
-    wrong = next((n for n in ("num_images", "fps") if getattr(options, n) is not None), None)
-    if wrong is not None:
-        raise OptionError(
-            f"{wrong} chooses new images, but {len(names)} exist already: leave it out, or give a "
-            "new database and folder"
-        )
     by_name = [names[i] for i in natural_order(names)]
     files = [image_file(folder, name) for name in by_name] if folder is not None else []
     if not all(file.exists() for file in files):
         files = []
     if options.frame_list is not None:
         chosen = read_frame_list(options.frame_list, num_frames, options)
-        if of_model:  # a model may lack some of the images
-            chosen = chosen.some(np.flatnonzero(np.isin(chosen.names, names)))
+        if of_model:
+            chosen = _keep_images_of_model(chosen, names)
         odd = sorted(set(names) ^ set(chosen.names))
         if odd:
             lists = "lists" if odd[0] in chosen.names else "does not list"
@@ -337,6 +347,11 @@ def _find_existing(
         frames_of_ends = chosen.frames[ends].tolist()
         check_content(paths, frames_of_ends, decode(frames_near(frames_of_ends)))
     return chosen
+
+
+def _keep_images_of_model(chosen: ChosenImages, names: Sequence[str]) -> ChosenImages:
+    """Keep the images of a model, given by their names; it may lack some of the chosen ones."""
+    return chosen.some(np.flatnonzero(np.isin(chosen.names, names)))
 
 
 def _by_content(

@@ -36,6 +36,20 @@ from colmap_av1.video.unchanged import unchanged
 
 # Extensions of images that can be read.
 READABLE = {*WRITE_PARAMETERS, ".bmp", ".tif", ".tiff"}
+# Extensions of images of phones, cameras and programs that cannot be read. They cause a warning,
+# unlike other files.
+UNREADABLE = {
+    ".webp",
+    ".heic",
+    ".heif",
+    ".avif",
+    ".dng",
+    ".cr2",
+    ".cr3",
+    ".nef",
+    ".arw",
+    ".raf",
+}
 
 
 def size_of_images(

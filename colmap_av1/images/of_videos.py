@@ -8,21 +8,21 @@ from pathlib import Path
 
 from colmap_av1.errors import ImageError, ModelError
 from colmap_av1.images.choosing import check_frame_list
-from colmap_av1.images.files import size_of_images
 from colmap_av1.images.inputs import Inputs
 from colmap_av1.images.masks import VideoMasks
+from colmap_av1.images.orientation import ShownImages, shown_images
 from colmap_av1.options import ImageOptions
 from colmap_av1.video.facts import Video
 
 
 @dataclass(frozen=True)
 class VideoImages:
-    """A video, and the model's images of it: their names in a folder, size and masks."""
+    """A video, and the model's images of it: names in a folder, how they show it, and masks."""
 
     video: Video
     names: list[str]
     folder: Path | None
-    size: tuple[int, int]
+    shown: ShownImages
     masks: VideoMasks | None
 
 
@@ -57,7 +57,7 @@ def images_of_videos(
         own_folder = folder / label if folder is not None else None
         images = _images_of_video(model, video, listed, own_folder, options)
         if masks is not None:
-            sizes_of_masks = [images.size, video.picture_size]
+            sizes_of_masks = [images.shown.size, images.shown.video_size]
             masks.check(sizes_of_masks, images.names, options)
         found.append(replace(images, masks=masks))
     return found
@@ -77,7 +77,7 @@ def _images_of_video(
             f"{model}: only one image of {video} is registered: give a model with two or more"
         )
     try:
-        size = size_of_images(sizes, video.picture_size, video.display.pixel_aspect)
+        shown = shown_images(video, sizes, folder)
     except ImageError as error:
         raise ImageError(f"{model}: {error}") from error
     missing = next((n for n in sizes if folder is not None and not (folder / n).is_file()), None)
@@ -85,4 +85,4 @@ def _images_of_video(
         raise ImageError(
             f"{folder}: lacks the model's image '{missing}': give the folder of the model's images"
         )
-    return VideoImages(video, list(sizes), folder, size, None)
+    return VideoImages(video, list(sizes), folder, shown, None)

@@ -12,27 +12,13 @@ from pathlib import Path, PurePosixPath
 import pycolmap
 
 from colmap_av1.errors import ImageError, writing
-from colmap_av1.images.files import READABLE, image_size, read_image
+from colmap_av1.images.files import READABLE, UNREADABLE, image_size, read_image
 from colmap_av1.images.names import image_file, natural_key, plain_name
 from colmap_av1.options.images import IMAGE_EXTENSIONS
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.texts import check_name, some_names
 from colmap_av1.video.unchanged import FileState, file_state
 
-# Extensions of photos of phones and cameras that cannot be read. They cause a warning, unlike other
-# files next to photos.
-_UNREADABLE_PHOTOS = {
-    ".webp",
-    ".heic",
-    ".heif",
-    ".avif",
-    ".dng",
-    ".cr2",
-    ".cr3",
-    ".nef",
-    ".arw",
-    ".raf",
-}
 # Markers of JPEG (ITU-T T.81, table B.1). The end of the image does not occur within a scan.
 _START_OF_IMAGE, _END_OF_IMAGE, _START_OF_SCAN = b"\xff\xd8", b"\xff\xd9", b"\xda"
 _MARKER = re.compile(rb"\xff+([^\x00\xff])")
@@ -84,7 +70,7 @@ def photo_files(folder: Path) -> tuple[list[Path], str | None]:
                 continue
             if suffix in READABLE:
                 found.append(path)
-            elif suffix in _UNREADABLE_PHOTOS:
+            elif suffix in UNREADABLE:
                 unread.append(path)
     named = sorted((p.as_posix() for p in unread), key=natural_key)
     convert = f"convert these to JPEG or PNG: {some_names(named)}"

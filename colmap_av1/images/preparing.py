@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_av1.geometry.cameras import make_camera
@@ -12,14 +12,13 @@ from colmap_av1.images.choosing import check_frame_list, existing_images
 from colmap_av1.images.files import (
     check_image_folder,
     check_images_there,
-    has_shape,
     image_size,
-    size_of_images,
     write_images,
 )
 from colmap_av1.images.masks import VideoMasks
 from colmap_av1.images.names import names_of_all
-from colmap_av1.images.recognising import check_content, frames_near, is_turned_back
+from colmap_av1.images.orientation import shown_images
+from colmap_av1.images.recognising import check_content, frames_near
 from colmap_av1.images.track_images import (
     ImageChoice,
     TrackedImages,
@@ -30,8 +29,7 @@ from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions, ReadOp
 from colmap_av1.tracks.video_tracks import VideoSource, open_source
 from colmap_av1.util.progress import Progress
 from colmap_av1.util.run_context import RunContext
-from colmap_av1.video.decoding import decode_frames
-from colmap_av1.video.display import UPRIGHT, Display, shown_size, turned_back
+from colmap_av1.video.display import Display
 from colmap_av1.video.facts import Video, count_shown
 from colmap_av1.video.unchanged import unchanged
 
@@ -59,30 +57,6 @@ class PreparedImages:
     size: tuple[int, int]
     pixel_aspect: float
     existed: bool
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """How the pictures of a video and existing images correspond.
-
-    Attributes:
-        existing: (width, height) of existing images, by name.
-        display: how the video's pictures are shown in the images.
-        video_size: (width, height) of the pictures with this display.
-        size: (width, height) of the images.
-    """
-
-    existing: dict[str, tuple[int, int]]
-    display: Display
-    video_size: tuple[int, int]
-    size: tuple[int, int]
-
-    @property
-    def pixel_aspect(self) -> float:
-        """Width of the images' pixels over their height."""
-        (width, height), (image_width, image_height) = self.video_size, self.size
-        # Images may be scaled by different factors along x and y.
-        return self.display.pixel_aspect * width * image_height / (height * image_width)
 
 
 def check_fit(
@@ -133,16 +107,20 @@ def prepare_images(
         OptionError: an option does not fit the video or its images.
     """
     # All checks run before the long work.
-    fit = _fit(video, folder, options.images, listed)
-    display, size, existing = fit.display, fit.size, list(fit.existing)
-    check_fit(options.camera, options.images, size, fit.pixel_aspect)
+    sizes = dict(listed)
+    if folder is not None and not listed:
+        there = existing_images(folder, options.images, video.picture_size)
+        sizes = {name: image_size(folder / name) for name in there}
+    shown = shown_images(video, sizes, folder)
+    size, existing = shown.size, list(sizes)
+    check_fit(options.camera, options.images, size, shown.pixel_aspect)
     if folder is not None:
         check_image_folder(folder, existing or options.images.file_name, size)
-        if size != fit.video_size:
+        if size != shown.video_size:
             check_images_there(folder, existing)
     if masks is not None:
         names = existing or names_of_all(options.images, count_shown(video))
-        masks.check([size, fit.video_size], names, options.images)
+        masks.check([size, shown.video_size], names, options.images)
 
     with (
         open_source(video, options.source, next_to=next_to, context=context) as source,
@@ -151,7 +129,7 @@ def prepare_images(
         found = track_chosen_images(
             source,
             options.tracking,
-            ImageChoice(options.images, existing, folder, display),
+            ImageChoice(options.images, existing, folder, shown.display),
             masks=masks,
             one_size=folder is not None,
             every_frame=options.camera.needs_every_frame,
@@ -161,51 +139,26 @@ def prepare_images(
         names, frames = found.chosen.names, found.chosen.frames.tolist()
         check_image_folder(folder, names, size)
         kept = [(n, f) for n, f in zip(names, frames, strict=True) if (folder / n).exists()]
-        if not existing and kept:
+        if kept and (not existing or options.images.is_spread):
             # Another program may have numbered other frames than the pattern does.
             some = dict([kept[0], kept[min(_CHECKED, len(kept) - 1)]])
             pictures = decode_pictures(
                 source,
                 found.tracks.num_frames,
                 options.reading,
-                display,
+                shown.display,
                 wanted=frames_near(some.values()),
                 context=context,
             )
             check_content([folder / name for name in some], list(some.values()), pictures)
     return PreparedImages(
         source=source,
-        display=display,
+        display=shown.display,
         tracked=found.with_tracks(found.tracks.scale_to(size)),
         size=size,
-        pixel_aspect=fit.pixel_aspect,
+        pixel_aspect=shown.pixel_aspect,
         existed=bool(existing),
     )
-
-
-def _fit(
-    video: Video,
-    folder: Path | None,
-    options: ImageOptions,
-    listed: Mapping[str, tuple[int, int]],
-) -> _Fit:
-    """Find existing images and how they show the video.
-
-    Raises:
-        ImageError: the images do not fit the video.
-    """
-    display, video_size = video.display, video.picture_size
-    existing = dict(listed)
-    if folder is not None and not existing:
-        names = existing_images(folder, options, video_size)
-        existing = {name: image_size(folder / name) for name in names}
-    back = _way_back(video, existing, folder)
-    if back is not None:
-        # The images were written by a program that does not rotate pictures.
-        display = replace(display, turn=UPRIGHT, pixel_aspect=back.pixel_aspect)
-        video_size = shown_size(video_size, back)
-    size = size_of_images(existing, video_size, display.pixel_aspect)
-    return _Fit(existing, display, video_size, size)
 
 
 def write_prepared(
@@ -259,26 +212,3 @@ def write_all_prepared(
         warning = blur_warning([folder / label / name for name in own.tracked.chosen.names])
         warnings += [warning] if warning is not None else []
     return num_written, warnings
-
-
-def _way_back(
-    video: Video,
-    existing: dict[str, tuple[int, int]],
-    folder: Path | None,
-) -> Display | None:
-    """The rotation from shown pictures to existing images; None if they have the same orientation.
-
-    It follows from the shape of the images. If both orientations fit, the content of the first
-    image decides, if its file exists. Otherwise images are assumed to be rotated as players and
-    FFmpeg show them.
-    """
-    display = video.display
-    if display.turn == UPRIGHT or not existing:
-        return None
-    back = turned_back(display)
-    name, size = next(iter(existing.items()))
-    as_shown = has_shape(size, video.picture_size)
-    as_stored = has_shape(size, shown_size(video.picture_size, back))
-    if as_shown and as_stored and folder is not None and (folder / name).exists():
-        return back if is_turned_back(folder / name, decode_frames(video), display) else None
-    return back if as_stored and not as_shown else None

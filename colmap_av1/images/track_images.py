@@ -76,7 +76,7 @@ class ImageChoice:
     @property
     def needs_tracks(self) -> bool:
         """Whether images are chosen from the tracks, and not before the motion is chained."""
-        return self.options.select == "parallax" and not self.existing
+        return self.options.select == "parallax"
 
 
 def track_chosen_images(

@@ -81,6 +81,11 @@ class ImageOptions(Options):
         names = ("num_images", "every", "fps", "frame_list")
         return [name for name in names if getattr(self, name) is not None]
 
+    @property
+    def is_spread(self) -> bool:
+        """Whether `num_images` or `fps` spreads the images over the video."""
+        return self.num_images is not None or self.fps is not None
+
     def __post_init__(self) -> None:
         super().__post_init__()
         given = self.ways

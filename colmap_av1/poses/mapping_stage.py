@@ -19,7 +19,7 @@ from colmap_av1.geometry.posed_model import (
     write_posed_model,
 )
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.options import MapOptions
+from colmap_av1.options import CameraOptions, MapOptions
 from colmap_av1.poses.adjusting import refines_intrinsics, with_second_distortion
 from colmap_av1.poses.mapper import MapperEffort, map_poses
 from colmap_av1.poses.match_stage import MatchesResult
@@ -115,7 +115,8 @@ def mapping_stage(
                 if found:
                     break
         if not found:
-            raise ModelError(_why_no_initial_pair(found_before, attempt.mapper))
+            camera = options.match.camera
+            raise ModelError(_why_no_initial_pair(found_before, attempt.mapper, camera))
         # Further images belong to the model of their nearest key image.
         found.sort(key=lambda model: -num_nearest(model, image_set, keyed))
         (partial / "poses").mkdir()
@@ -177,10 +178,13 @@ def with_model_first(run: Run, mapped: Kept[MappedResult], file: str) -> Kept[Ma
     return replace(mapped, result=result, digest=digest_of([mapped.digest, file]))
 
 
-def _why_no_initial_pair(found: MatchesResult, mapper: str) -> str:
-    """Why a mapper found no initial pair, and the remedy."""
+def _why_no_initial_pair(found: MatchesResult, mapper: str, camera: CameraOptions) -> str:
+    """Why a mapper found no initial pair with these camera options, and the remedy."""
     failure = f"COLMAP's {mapper} mapper finds no initial pair"
     other = "incremental" if mapper == "global" else "global"
+    options = ("camera_model", "camera_params")
+    missing = [f"--{name}" for name in options if getattr(camera, name) is None]
+    give = f"give {' and '.join(missing) or 'other --camera_params'}, or try --mapper {other}"
     most_agree = found.num_verified_pairs >= found.num_pairs / 2
     if most_agree and found.num_flat_pairs > found.num_verified_pairs / 2:
         return (
@@ -197,10 +201,9 @@ def _why_no_initial_pair(found: MatchesResult, mapper: str) -> str:
     if found.assumes_focal_length:
         return (
             f"{failure}: the focal length is a default and may be far off, or there is too little "
-            "parallax, as when the camera moves along its optical axis: "
-            f"give --camera_model and --camera_params, or try --mapper {other}"
+            f"parallax, as when the camera moves along its optical axis: {give}"
         )
     return (
         f"{failure}: too little parallax between images that share tracks, or wrong intrinsics: "
-        f"give --camera_model and --camera_params, or try --mapper {other}"
+        f"{give}"
     )

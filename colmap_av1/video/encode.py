@@ -108,7 +108,8 @@ def encode(
         BitstreamError: the video is damaged and `strict` is set.
         EncodeError: no encoder works.
         WriteError: the output cannot be written.
-        OptionError: an option has an invalid value, or the output exists.
+        OptionError: an option has an invalid value, the output exists, or its format cannot hold
+            the pixel aspect.
 
     Examples:
         >>> from colmap_av1 import EncodeOptions, encode
@@ -151,8 +152,13 @@ def _encode(
     target = output.resolve()  # a link keeps leading to the output
     remove_leftovers(target.parent, target.name)
     file, damage = counted(read_video(video))
-    positions = read_positions(file) if telemetry else None
     output_format = _FORMATS[output.suffix.lower()]
+    if output_format == "ivf" and file.display.pixel_aspect != 1:
+        raise OptionError(
+            f"{output}: IVF cannot hold the pixel aspect of {path}, without which focal lengths "
+            "are wrong: give an output that ends in .mp4, .mkv or .webm"
+        )
+    positions = read_positions(file) if telemetry else None
     second_input, copied = carrying(file, positions, output_format) if telemetry else ([], [])
     name, ffmpeg = find_encoder(options)
     encoder = ENCODERS[name]

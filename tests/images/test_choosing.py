@@ -143,10 +143,11 @@ def test_blurred_frames_are_replaced_by_sharp_neighbours() -> None:
 
 def test_frame_list_is_read(tmp_path: Path) -> None:
     path = tmp_path / "list.txt"
-    path.write_text("# mine\n\n9 last one.png\n0\nimg_0005.jpg\n")
+    path.write_text("# mine\n\n9 last one.png\n0\n2, img1.png\n3,img2.png\nimg_0005.jpg\n")
     chosen = read_frame_list(path, 10, ImageOptions(first_number=1))
-    assert chosen.frames.tolist() == [0, 4, 9]
-    assert chosen.names == ["frame_000000.png", "img_0005.jpg", "last one.png"]
+    assert chosen.frames.tolist() == [0, 2, 3, 4, 9]
+    names = ["frame_000000.png", "img1.png", "img2.png", "img_0005.jpg", "last one.png"]
+    assert chosen.names == names
 
 
 @pytest.mark.parametrize(
@@ -159,7 +160,8 @@ def test_frame_list_is_read(tmp_path: Path) -> None:
         ("5\n", "10"),
         ("", "no frame"),
         ("0\n-1\n", "line 2"),
-        ("0,5\n", "line 1"),
+        ("img1.png 0\n", "line 1"),
+        ("img1.png,0\n", "line 1"),
         ("1.5\n", "line 1"),
         (b"\xff\xd8\xff\xe0", r"list\.txt"),
         (None, r"list\.txt"),
@@ -389,6 +391,31 @@ def test_missing_images_of_an_earlier_run_are_written_again(
         again = match(f"{number}.db", clip, image_path="images", options=options)
         assert (again.num_images, again.num_written_images) == (len(names), num_missing)
     assert sorted(path.name for path in Path("images").iterdir()) == names
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [{"num_images": 5}, {"fps": 10}, {"num_images": 5, "select": "parallax"}],
+)
+def test_a_choice_can_be_repeated_on_its_own_database(
+    clip: Path, tmp_path: Path, choice: dict[str, Any]
+) -> None:
+    options = replace(DENSE, images=ImageOptions(**choice), on_existing="replace")
+    database, folder = tmp_path / "a.db", tmp_path / "images"
+    first = match(database, clip, image_path=folder, options=options)
+    again = match(database, clip, image_path=folder, options=options)
+    assert (again.num_images, again.num_written_images) == (first.num_images, 0)
+    assert again.num_matches == first.num_matches > 0
+    other = replace(options, images=ImageOptions(num_images=7))
+    with pytest.raises(OptionError, match="exist"):
+        match(database, clip, image_path=folder, options=other)
+
+
+def test_images_that_cannot_be_read_cause_a_warning(clip: Path, tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "0.webp").write_bytes(b"RIFF")
+    with pytest.warns(UserWarning, match=r"0\.webp"):
+        match(tmp_path / "a.db", clip, image_path=tmp_path / "images")
 
 
 def test_images_that_another_program_numbered_from_1_are_not_of_an_earlier_run(

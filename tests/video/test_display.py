@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from colmap_av1.cli import reports
-from colmap_av1.errors import VideoError
+from colmap_av1.errors import OptionError, VideoError
 from colmap_av1.match import match
 from colmap_av1.motion.info import read_info
 from colmap_av1.motion.reading import read_motion
@@ -36,6 +36,7 @@ from colmap_av1.video.display import (
     shown_size,
     turn_of_matrix,
 )
+from colmap_av1.video.encode import encode as convert
 from colmap_av1.video.facts import read_video
 
 # The presets choose tracks by cells of the picture, which differ in cropped or scaled pictures.
@@ -308,6 +309,17 @@ def test_non_square_pixels_get_a_camera_with_two_focal_lengths(
     options = MatchOptions(camera=CameraOptions("SIMPLE_RADIAL"), verify=PAIRS)
     (warning,) = match(tmp_path / "b.db", turned, options=options).warnings
     assert "SIMPLE_RADIAL" in warning
+
+
+def test_conversion_to_a_format_without_pixel_aspect_is_refused(
+    encode: Encode, tmp_path: Path
+) -> None:
+    clip = encode(make_frames(10), tmp_path / "c.mp4", *AV1, "-vf", "setsar=3/2")
+    with pytest.raises(OptionError, match="aspect"):
+        convert(clip, tmp_path / "d.ivf")
+    convert(clip, tmp_path / "d.webm")
+    assert read_video(tmp_path / "d.webm").display.pixel_aspect == pytest.approx(1.5)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["c.mp4", "d.webm"]
 
 
 def info_rows(video: Path) -> list[tuple[str, str]]:

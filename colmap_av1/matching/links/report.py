@@ -77,7 +77,10 @@ class LinkReport:
             return ()
         if self.num_images == 0:
             names = ", ".join(f"'{name}'" for part in self.parts for name in part)
-            return (f"{names} are not connected with --links none: they become separate models",)
+            return (
+                f"--links none does not connect {names}: they become separate models unless other "
+                "matches of the database connect them",
+            )
         groups = " with ".join(", ".join(f"'{name}'" for name in part) for part in self.parts)
         return (
             f"nothing in the pictures connects {groups}: they become {len(self.parts)} separate "
