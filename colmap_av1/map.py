@@ -60,8 +60,8 @@ class MapReport:
         place: coordinates of the model in folder 0: units, axes, origin and their source, as in
             `place.json`.
         figures: figures of the model in folder 0.
-        expected_error: expected error of its camera centres as a share of their extent; None if it
-            is not known.
+        expected_error: expected error of its camera centres as a share of their extent, by the
+            covariance of the observations; None if it is not known.
         long_range: result of the long-range check of this model; None if its images cannot be read.
         seconds: wall time of each stage.
         warnings: warnings for the user.

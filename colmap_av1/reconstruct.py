@@ -102,8 +102,8 @@ class ReconstructReport:
         long_range: median long-range epipolar error in pixels, over pairs of images at least ten
             images apart that see the same place; None if there are no such pairs.
         long_range_largest: 90th percentile of the long-range epipolar error.
-        expected_error: expected error of the camera centres as a share of their extent, see
-            `check_model`; None if it is not known.
+        expected_error: expected error of the camera centres as a share of their extent, by the
+            covariance of the observations; None if it is not known.
         read_outs: rolling-shutter read-out time of each video in milliseconds, from the first row
             to the last; None if the tracks were not corrected for it.
         place: where the model lies in the world, as in `place.json`.

@@ -18,7 +18,7 @@ from colmap_av1.database.reading import (
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.colmap_model import ModelImage, posed_images
 from colmap_av1.matching.mapper_limits import MIN_INLIERS
-from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
+from colmap_av1.matching.two_view_models import error_by_poses
 from colmap_av1.poses.seams import images_in_time
 from colmap_av1.util.arrays import Bools, Floats, Ints
 
@@ -151,9 +151,10 @@ def _fitting(
                     "'colmap-av1 check' for a full list of problems"
                 )
             views = [images[of_id[k]] for k in (a, b)]
-            focal = np.mean([cameras[view.camera_id].mean_focal_length() for view in views])
-            xa, xb = rays[a][:, matches[:, 0]], rays[b][:, matches[:, 1]]
-            essential = essential_of_poses(*(view.cam_from_world for view in views))
-            error = float(focal) * sampson_error(essential, xa, xb)
+            error = error_by_poses(
+                [view.cam_from_world for view in views],
+                [cameras[view.camera_id] for view in views],
+                [rays[a][:, matches[:, 0]], rays[b][:, matches[:, 1]]],
+            )
             i, j = sorted((of_id[a], of_id[b]))
-            yield i, j, error[np.isfinite(error)] <= _MAX_ERROR
+            yield i, j, error <= _MAX_ERROR

@@ -27,8 +27,8 @@ class ModelCheck:
     Attributes:
         figures: numbers of images and points, errors and focal length.
         seams: the points that join neighbouring images.
-        expected_error: expected error of the camera centres as a share of their extent, see
-            `expected_error`; None if it is not known.
+        expected_error: expected error of the camera centres as a share of their extent, by the
+            covariance of the observations; None if it is not known.
         crossings: the matches across neighbouring images; None without a database.
         long_range: the long-range check; None without an image folder.
     """

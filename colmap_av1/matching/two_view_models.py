@@ -9,12 +9,13 @@ iterations.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import poselib
+import pycolmap
 
 from colmap_av1.options import VerifyOptions
 from colmap_av1.options.matching import MIN_MATCHES
@@ -356,6 +357,24 @@ def essential_of_poses(a: Floats, b: Floats) -> Floats:
     rotation = b[:, :3] @ a[:, :3].T
     x, y, z = b[:, 3] - rotation @ a[:, 3]
     return np.asarray(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation)
+
+
+def error_by_poses(
+    poses: Sequence[Floats], cameras: Sequence[pycolmap.Camera], rays: Sequence[Floats]
+) -> Floats:
+    """The Sampson error of matches by the poses of two images.
+
+    Args:
+        poses: [3, 4] cam_from_world of both images.
+        cameras: their cameras.
+        rays: [2, n] positions of the matches in both images, (x / z, y / z).
+
+    Returns:
+        float64 [m] errors in pixels; without matches at distorted positions that have no ray.
+    """
+    focal = np.mean([camera.mean_focal_length() for camera in cameras])
+    error = float(focal) * sampson_error(essential_of_poses(*poses), *rays)
+    return np.asarray(error[np.isfinite(error)])
 
 
 def transfer_inliers(H: Floats, xa: Floats, xb: Floats, max_error: float) -> Bools:

@@ -13,7 +13,7 @@ import numpy as np
 
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
+from colmap_av1.matching.two_view_models import error_by_poses
 from colmap_av1.tracks.tracks import Tracks
 
 # A track fits the poses of two images if its Sampson error is at most this, in pixels.
@@ -51,10 +51,7 @@ def contradicted_seams(
             np.asarray(camera.cam_from_img(tracks.xy[own[rows]].astype(np.float64))).T
             for camera, own, rows in zip(cameras, seen, both, strict=True)
         ]
-        focal = np.mean([camera.mean_focal_length() for camera in cameras])
-        essential = essential_of_poses(*(view.cam_from_world for view in views))
-        error = float(focal) * sampson_error(essential, *rays)
-        error = error[np.isfinite(error)]
+        error = error_by_poses([view.cam_from_world for view in views], cameras, rays)
         return bool(np.mean(error <= _MAX_ERROR) < _LEAST_FITTING)
 
     return [seam for seam in seams if is_contradicted(seam)]

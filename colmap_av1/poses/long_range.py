@@ -21,7 +21,7 @@ from colmap_av1.images.names import image_file, natural_order
 from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.sift import Features, extract_features, masked_features
 from colmap_av1.matching.links.matching import match_pairs
-from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
+from colmap_av1.matching.two_view_models import error_by_poses
 from colmap_av1.options import VerifyOptions
 from colmap_av1.util.arrays import Floats, Picture
 from colmap_av1.util.progress import Progress, no_progress
@@ -190,16 +190,14 @@ class LongRangeCheck:
 
     def _errors(self, i: int, j: int, xa: NDArray[np.floating], xb: NDArray[np.floating]) -> Floats:
         """Symmetric epipolar distance in pixels of matches [n, 2] by the poses of two images."""
-        a, b = self._images[i].cam_from_world, self._images[j].cam_from_world
-        normalised = [
+        cameras = [self._cameras[k] for k in (i, j)]
+        rays = [
             np.asarray(camera.cam_from_img(xy.astype(np.float64))).T
-            for camera, xy in ((self._cameras[i], xa), (self._cameras[j], xb))
+            for camera, xy in zip(cameras, (xa, xb), strict=True)
         ]
-        focal = np.mean([self._cameras[k].mean_focal_length() for k in (i, j)])
+        poses = [self._images[k].cam_from_world for k in (i, j)]
         # The Sampson error splits the distance between both images; sqrt(2) refers it to one.
-        distance = np.sqrt(2) * focal * sampson_error(essential_of_poses(a, b), *normalised)
-        # Some distorted positions have no ray.
-        return np.asarray(distance[np.isfinite(distance)])
+        return np.asarray(np.sqrt(2) * error_by_poses(poses, cameras, rays))
 
 
 def model_long_range_errors(
