@@ -17,9 +17,9 @@ from colmap_av1.geometry.colmap_model import ModelImage, read_model
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.contradicted_seams import contradicted_seams
 from colmap_av1.poses.parts import certain_parts, parts_of
 from colmap_av1.poses.track_matches import tracks_of_model
+from colmap_av1.poses.unconfirmed_seams import unconfirmed_seams
 from colmap_av1.reconstruct import reconstruct
 
 
@@ -127,12 +127,12 @@ def test_points_do_not_join_parts_across_a_seam_that_tracks_contradict() -> None
     own = [*stretch(0, 11), *stretch(12, 23), *stretch(24, 35)]
     known = model(image_set, [*own, *[[0, 5, 30, 35]] * 200, *[[12, 20, 30, 35]] * 200])
     assert len(parts_of(known, image_set, seams)) == 1
-    parts = parts_of(known, image_set, seams, contradicted=seams[:1])
+    parts = parts_of(known, image_set, seams, unconfirmed=seams[:1])
     assert parts == [names(image_set, *range(12, 36)), names(image_set, *range(12))]
 
 
 @pytest.mark.parametrize("share", [0.2, 0.9])
-def test_a_seam_is_contradicted_if_most_tracks_do_not_fit(share: float) -> None:
+def test_a_seam_is_unconfirmed_if_most_tracks_do_not_fit(share: float) -> None:
     image_set = images(12)
     known = seen_at(model(image_set, [[5, 6]] * 100), [10.0] * 100)
     xy = known.points.xy.copy()
@@ -140,9 +140,12 @@ def test_a_seam_is_contradicted_if_most_tracks_do_not_fit(share: float) -> None:
     points = replace(known.points, xy=xy)
     tracks = tracks_of_model(replace(known, points=points), image_set)
     seams = [seam(image_set, 5)]
-    assert contradicted_seams(known, image_set, tracks, seams) == (seams if share < 0.4 else [])
+    contradicted = seams if share < 0.4 else []
+    for few_points in ([], seams):
+        assert unconfirmed_seams(known, image_set, tracks, seams, few_points) == contradicted
     few = tracks.keep_tracks(np.arange(tracks.num_tracks) < 20)
-    assert contradicted_seams(known, image_set, few, seams) == []
+    assert unconfirmed_seams(known, image_set, few, seams, []) == []
+    assert unconfirmed_seams(known, image_set, few, seams, seams) == seams
 
 
 def test_another_video_joins_parts() -> None:
