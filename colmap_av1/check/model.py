@@ -15,6 +15,7 @@ from colmap_av1.database.file import open_unaltered
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.posed_model import posed_model
 from colmap_av1.geometry.uncertainty import expected_error, uncertainty_warning
+from colmap_av1.images.names import natural_key
 from colmap_av1.poses.long_range import LongRangeErrors, model_long_range_errors
 from colmap_av1.poses.seams import Seams, model_seams
 from colmap_av1.util.progress import Progress, no_progress
@@ -86,14 +87,14 @@ def check_model(
     long_range = None
     if image_path is not None:
         long_range = model_long_range_errors(model, Path(image_path), progress)
-    mapped = list[str]()
+    posed = posed_model(model, with_points=True)
+    names = {image.name for image in posed.images}
     if database is not None:
         with open_unaltered(Path(database)) as connection:
-            mapped = [name for (name,) in connection.execute("SELECT name FROM images")]
-    posed = posed_model(model, with_points=True)
+            names.update(name for (name,) in connection.execute("SELECT name FROM images"))
     return ModelCheck(
         figures=figures,
-        seams=model_seams(posed, all_images=mapped),
+        seams=model_seams(posed, all_images=sorted(names, key=natural_key)),
         expected_error=expected_error(posed),
         crossings=None if database is None else model_crossings(model, Path(database)),
         long_range=long_range,

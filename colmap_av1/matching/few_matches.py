@@ -33,6 +33,8 @@ def few_match_gaps(
     num_inliers: NDArray[np.integer],
     names: Sequence[str],
     videos: Sequence[Hashable],
+    *,
+    order: Sequence[int] | None = None,
 ) -> tuple[Gap, ...]:
     """Find gaps with far fewer matches across them than across the gaps before and after.
 
@@ -42,17 +44,18 @@ def few_match_gaps(
     Args:
         pairs: integers [m, 2] image indices of the pairs that mappers use.
         num_inliers: integers [m] verified matches of each pair.
-        names: names of the images; their natural order is the order in time.
+        names: names of the images.
         videos: identifies the video of each image, see `videos_of`.
+        order: indices of the images in the order of time; None: the natural order of their names.
     """
     rows: dict[Hashable, list[int]] = {}
-    for i in natural_order(names):
+    for i in order if order is not None else natural_order(names):
         rows.setdefault(videos[i], []).append(i)
     # Order the images by video, so that no pair of one video crosses a gap of another.
-    order = [i for own in rows.values() for i in own]
+    by_video = [i for own in rows.values() for i in own]
     rank, row = np.empty(len(names), np.int64), np.empty(len(names), np.int64)
-    rank[order] = np.arange(len(order))
-    row[order] = np.repeat(np.arange(len(rows)), [len(own) for own in rows.values()])
+    rank[by_video] = np.arange(len(by_video))
+    row[by_video] = np.repeat(np.arange(len(rows)), [len(own) for own in rows.values()])
     inside = row[pairs[:, 0]] == row[pairs[:, 1]]
     ends = np.sort(rank[pairs[inside]], axis=1)
     change = np.zeros(len(names), dtype=np.int64)
@@ -113,7 +116,12 @@ def few_matches_warning(gaps: Sequence[Gap]) -> str | None:
 def matching_warning(matched: MatchedImages, image_set: ImageSet) -> str | None:
     """Warn of gaps with few matches between images of a video."""
     used, counts = used_pairs(matched)
+    names = image_set.images.names
     gaps = few_match_gaps(
-        matched.pairs[used], counts[used], image_set.images.names, image_set.sequence.tolist()
+        matched.pairs[used],
+        counts[used],
+        names,
+        image_set.sequence.tolist(),
+        order=range(len(names)),
     )
     return few_matches_warning(gaps)

@@ -15,7 +15,7 @@ import pycolmap
 
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.geometry.posed_model import PosedModel
-from colmap_av1.images.names import natural_key, natural_order, videos_of
+from colmap_av1.images.names import natural_order, videos_of
 from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.grouping import sums_beside_gaps
 
@@ -62,7 +62,7 @@ class Seams:
     - `scale_lost`: points connect the sides, but hardly any of them have depth on both.
 
     Attributes:
-        pairs: names of the images before and after each seam, in natural order.
+        pairs: names of the images before and after each seam, in the order of time.
         num_points: int64 [n] points with views on both sides, of the same video and at most ten
             images apart; or fewer, see `_points_of_loose_stretches`.
         num_elsewhere: int64 [n] points with views on both sides, however far apart.
@@ -175,17 +175,18 @@ class Seams:
 def model_seams(
     model: PosedModel,
     photos: Collection[str] = (),
-    all_images: Collection[str] = (),
+    all_images: Sequence[str] = (),
 ) -> Seams:
     """Count the points at each seam of a model, see `Seams`.
 
     Args:
         model: the model, with points.
         photos: names of photos, which have no neighbours in time.
-        all_images: names of the images that were mapped. Those that the model lacks count in the
-            distance between two images.
+        all_images: names of the images that were mapped, in the order of time. Those that the model
+            lacks count in the distance between two images. Empty: those of the model, in the
+            natural order of their names.
     """
-    images, neighbours = images_in_time(model.images)
+    images, neighbours = images_in_time(model.images, all_images)
     views, point, xyz = _seen_points(model, images)
     num_images, num_seams = len(images), max(len(images) - 1, 0)
     is_inside = np.isin(np.arange(num_seams), neighbours)
@@ -224,8 +225,11 @@ def model_seams(
         return np.cumsum(change)[:num_seams]
 
     crossing = between(views[near], views[near + 1])
-    place = _places_in_time([image.name for image in images], all_images)
-    near = near[np.diff(place[views])[near] <= _REACH]
+    rank = np.arange(num_images)
+    if all_images:
+        rank_of = {name: k for k, name in enumerate(all_images)}
+        rank = np.array([rank_of[image.name] for image in images], np.int64)
+    near = near[np.diff(rank[views])[near] <= _REACH]
     soon = between(views[near], views[near + 1])
     num_points = _points_of_loose_stretches(crossing, soon, is_seam, views, point)
     deep = deep_from < num_images
@@ -264,13 +268,23 @@ def _are_held_by_others(sequence: Ints, views: Ints, point: Ints) -> Bools:
     return held
 
 
-def images_in_time(images: Sequence[ModelImage]) -> tuple[list[ModelImage], list[int]]:
-    """The registered images of a model, in the natural order of their names.
+def images_in_time(
+    images: Sequence[ModelImage], all_images: Sequence[str] = ()
+) -> tuple[list[ModelImage], list[int]]:
+    """The registered images of a model, in the order of time.
+
+    Args:
+        images: the images.
+        all_images: names of these and maybe other images, in the order of time; empty: the natural
+            order of the names is that of time.
 
     Returns:
         The images, and indices of those whose next one is a neighbour in time, see `videos_of`.
     """
-    ordered = [images[k] for k in natural_order([image.name for image in images])]
+    names = [image.name for image in images]
+    by_name = dict(zip(names, images, strict=True))
+    in_time = all_images or [names[k] for k in natural_order(names)]
+    ordered = [by_name[name] for name in in_time if name in by_name]
     videos = videos_of([i.camera_id for i in ordered], [i.name for i in ordered])
     return ordered, [k for k, (own, other) in enumerate(pairwise(videos)) if own == other]
 
@@ -317,13 +331,6 @@ def _points_of_loose_stretches(
 def _share_of_median(num_points: Ints, share: float, most: float) -> float:
     """A share of the median number of points of all seams, or `most` if that is less."""
     return min(share * float(np.median(num_points)), most)
-
-
-def _places_in_time(names: Sequence[str], all_images: Collection[str]) -> Ints:
-    """Place of each image of a model, int64 [n], in the natural order of these and all images."""
-    everything = sorted({*names, *all_images}, key=natural_key)
-    place = {name: k for k, name in enumerate(everything)}
-    return np.array([place[name] for name in names], np.int64)
 
 
 def _seen_points(model: PosedModel, images: Sequence[ModelImage]) -> tuple[Ints, Ints, Floats]:

@@ -102,6 +102,10 @@ def test_gaps_do_not_depend_on_the_order_of_images(random: object, gap: int) -> 
     shuffled = [names[i] for i in order]
     found = few_match_gaps(place[pairs][:, ::-1], count, shuffled, [rows[i] for i in order])
     assert found == expected
+    # In the natural order of these names, the images of each half of a video are mixed.
+    mixed = [f"{name[0]}/{(7 * k) % NUM_IMAGES}.png" for k, name in enumerate(names)]
+    found = few_match_gaps(pairs, count, mixed, rows, order=range(len(names)))
+    assert [(g.before, g.after) for g in found] == [(mixed[gap], mixed[gap + 1])]
 
 
 def test_frames_with_an_unusually_low_inter_share_are_found() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import sqlite3
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -30,7 +30,7 @@ _SOUND = 0.95
 
 
 def seams_of(
-    model: pycolmap.Reconstruction, photos: Collection[str] = (), all_images: Collection[str] = ()
+    model: pycolmap.Reconstruction, photos: Collection[str] = (), all_images: Sequence[str] = ()
 ) -> Seams:
     return model_seams(posed_model(model, with_points=True), photos, all_images)
 
@@ -98,6 +98,18 @@ def test_cut_is_no_weak_seam_if_a_loop_closure_joins_its_sides(tmp_path: Path) -
     assert seams_of(read_model(tmp_path)).disconnected == [14]
     write_row(tmp_path, views, 150)
     assert seams_of(read_model(tmp_path)).disconnected == []
+
+
+def test_names_need_not_be_in_the_order_of_time(tmp_path: Path) -> None:
+    """A list of frames may give images any names."""
+    views = [[k, k + 1, k + 2] for k in range(28) if k not in (13, 14) for _ in range(100)]
+    write_row(tmp_path, views, 0)
+    model = read_model(tmp_path)
+    in_time = [f"{(7 * k) % 30}.png" for k in range(30)]
+    for image in model.images.values():
+        image.name = in_time[int(Path(image.name).stem)]
+    seams = seams_of(model, all_images=in_time)
+    assert [seams.pairs[i] for i in seams.disconnected] == [(in_time[14], in_time[15])]
 
 
 def test_seams_are_found_with_a_camera_per_image(tmp_path: Path) -> None:
