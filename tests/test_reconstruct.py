@@ -463,7 +463,7 @@ def test_failed_long_range_check_adds_loop_closures(
     for name in ("long_range", "first_estimate"):
         (copy / ".stages" / f"{name}.json").unlink()
     found = reconstruct(SCENE, copy, options=options)
-    assert found.links.searched_all == (links == "auto")
+    assert found.links.searched_loops == (links == "auto")
     assert (found.links.num_images > 0) == (links == "auto")
     assert found.num_registered == NUM_IMAGES
     assert any("--links sift" in warning for warning in found.warnings) == (links == "none")
@@ -483,7 +483,7 @@ def test_failed_long_range_check_adds_loop_closures_outside_fast_stretches(
     found = reconstruct(SCENE, copy, options=OPTIONS)
     assert found.links.fast == ((0, 9),)  # every third frame is an image, so this is four images
     assert found.links.num_images > 4
-    assert found.links.searched_all
+    assert found.links.searched_loops
 
 
 def test_warning_names_images_that_are_not_registered(

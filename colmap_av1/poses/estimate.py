@@ -264,7 +264,7 @@ def _larger_model(estimates: _Estimates, links: _FurtherLinks, size: int) -> str
 
 def _needs_loops(run: Run, posed: Posed) -> bool:
     """Whether pictures far apart contradict the poses, and no loop closures were looked for."""
-    looked = run.options.match.links.links != "auto" or posed.matches.result.links.searched_all
+    looked = run.options.match.links.links != "auto" or posed.matches.result.links.searched_loops
     return posed.is_contradicted and not looked
 
 

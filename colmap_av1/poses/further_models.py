@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from colmap_av1.errors import ModelError, writing
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
@@ -25,9 +24,6 @@ from colmap_av1.poses.track_stage import LEAST_IMAGES
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.files import remove_leftovers
 from colmap_av1.util.stages import Kept, remove_products, run_stage
-
-if TYPE_CHECKING:
-    import pycolmap
 
 # Folders of further models, each followed by its number.
 _FOLDER = "model_"
@@ -82,7 +78,7 @@ def further_poses(
     """
     first_model = read_posed_model(run.stages / first.last.result.poses)
     left = set(image_set.images.names) - first_model.by_name.keys()
-    waiting = _other_models(run, first)
+    waiting = [_with_cameras_of(first_model, other) for other in _other_models(run, first)]
     number = 1
     while waiting:
         mapped = waiting.pop(0)
@@ -90,7 +86,7 @@ def further_poses(
         if len(known & left) < LEAST_IMAGES:  # nearly all of its images are in an earlier model
             continue
         own = _run_of_model(run, number)
-        own_poses = _poses_of_model(own, first, mapped, first_model.cameras)
+        own_poses = _poses_of_model(own, first, mapped)
         if keeps_intrinsics(mapped.model, first_model):
             own = _with_known_intrinsics(own)
         free = left.difference(mapped.excluded, *(other.model.by_name for other in waiting))
@@ -197,23 +193,25 @@ def _with_known_intrinsics(run: Run) -> Run:
     return replace(run, options=replace(run.options, mapping=mapping))
 
 
-def _poses_of_model(
-    own: Run, first: Posed, mapped: _MappedModel, known: Mapping[int, pycolmap.Camera]
-) -> Kept[MappedResult]:
+def _with_cameras_of(first: PosedModel, mapped: _MappedModel) -> _MappedModel:
+    """A model of the mapper, with the cameras of the first model, which are adjusted."""
+    cameras = {i: first.cameras.get(i, camera) for i, camera in mapped.model.cameras.items()}
+    return replace(mapped, model=PosedModel(cameras, mapped.model.images))
+
+
+def _poses_of_model(own: Run, first: Posed, mapped: _MappedModel) -> Kept[MappedResult]:
     """Write the poses of a further model to its stages.
 
     Args:
         own: the run of the further model, see `_run_of_model`.
         first: the first model.
         mapped: the further model.
-        known: cameras of the first model by id, which replace those of the further model.
     """
 
     def make(partial: Path) -> MappedResult:
-        model = mapped.model
-        cameras = {i: known.get(i, camera) for i, camera in model.cameras.items()}
-        write_posed_model(partial / "mapped.npz", PosedModel(cameras, model.images))
-        return MappedResult("mapped.npz", len(model.images), first.mapped.result.mapper, ())
+        write_posed_model(partial / "mapped.npz", mapped.model)
+        count = len(mapped.model.images)
+        return MappedResult("mapped.npz", count, first.mapped.result.mapper, ())
 
     return run_stage(
         own.stages,

@@ -95,11 +95,11 @@ class LongRangeErrors:
         """Whether the images contradict the poses."""
         return self.largest is not None and self.largest > _MAX_ERROR
 
-    def warning(self, *, linked: bool = False) -> str | None:
+    def warning(self, *, searched_loops: bool = False) -> str | None:
         """Warning about poses that the images contradict, or about images without matches.
 
         Args:
-            linked: whether loop closures have been searched.
+            searched_loops: whether loop closures have been searched in all videos.
         """
         if self.num_in_vain >= _MIN_IN_VAIN:
             cause = "the poses are wrong"
@@ -115,10 +115,11 @@ class LongRangeErrors:
         if not self.contradicts_poses or self.worst is None:
             return None
         first, second = self.worst
+        advice = "" if searched_loops else "; --links sift matches more images"
         return (
             f"images far apart in time contradict the poses, with a long-range epipolar error of "
             f"{self.largest:.1f} px (90th percentile), largest between '{first}' and '{second}': "
-            f"surfaces may be doubled there{'' if linked else '; --links sift matches more images'}"
+            f"surfaces may be doubled there{advice}"
         )
 
 

@@ -56,7 +56,8 @@ def long_range_stage(
     posed: Kept[PosesResult],
     *,
     masks_digest: str | None,
-    linked: bool,
+    searched_loops: bool,
+    number: int,
 ) -> Kept[LongRangeResult]:
     """Match a few pairs of images far apart in time, and compare the matches with the poses.
 
@@ -67,7 +68,8 @@ def long_range_stage(
         dynamic_masks: masks that exclude dynamic pixels, by image name.
         posed: the stage that estimated the poses.
         masks_digest: digest of the stage that made the masks; None without masks.
-        linked: whether loop closures have been searched.
+        searched_loops: whether loop closures have been searched in all videos.
+        number: number of the adjustment that the poses are from, which names the stage.
     """
 
     def make(_: Path) -> LongRangeResult:
@@ -76,14 +78,14 @@ def long_range_stage(
         return LongRangeResult(
             median=far.median,
             largest=far.largest,
-            warning=far.warning(linked=linked),
+            warning=far.warning(searched_loops=searched_loops),
             contradicts_poses=far.contradicts_poses,
         )
 
     return run_stage(
         run.stages,
-        "long_range",
-        [posed.digest, masks_digest, linked],
+        f"long_range_{number}" if number > 1 else "long_range",
+        [posed.digest, masks_digest, searched_loops],
         LongRangeResult,
         products=[],
         make=make,

@@ -185,8 +185,10 @@ def pose_images(
     return replace(posed, long_range=_long_range_check(run, posed, image_set))
 
 
-def _long_range_check(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongRangeResult]:
-    """The long-range check of the poses."""
+def _long_range_check(
+    run: Run, posed: Posed, image_set: ImageSet, *, number: int = 1
+) -> Kept[LongRangeResult]:
+    """The long-range check of the poses; `number` as in `long_range_stage`."""
     return long_range_stage(
         run,
         posed.tracks,
@@ -194,7 +196,8 @@ def _long_range_check(run: Run, posed: Posed, image_set: ImageSet) -> Kept[LongR
         posed.dynamic_masks,
         posed.last,
         masks_digest=posed.masks_digest,
-        linked=posed.matches.result.links.searched_all,
+        searched_loops=posed.matches.result.links.searched_loops,
+        number=number,
     )
 
 
@@ -370,5 +373,6 @@ def split_at_seams(
         )
         posed = replace(posed, adjustment=_adjusted(run, posed, image_set, parts, number=number))
         if posed.long_range is not None:
-            posed = replace(posed, long_range=_long_range_check(run, posed, image_set))
+            check = _long_range_check(run, posed, image_set, number=number)
+            posed = replace(posed, long_range=check)
     return posed

@@ -182,7 +182,7 @@ def link_images(
     report = replace(
         linked.report,
         num_images=len(examined),
-        searched_all=searches_all(plan, image_set, matched, images_apart),
+        searched_loops=searches_all(plan, image_set, matched, images_apart),
     )
     return replace(linked, report=report)
 

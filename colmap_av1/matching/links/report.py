@@ -18,7 +18,7 @@ class LinkReport:
 
     Attributes:
         num_images: images whose pictures were examined.
-        searched_all: whether loop closures were searched in all videos.
+        searched_loops: whether loop closures were searched in all videos.
         num_links: pairs that were linked.
         num_revisits: linked pairs that close a loop.
         num_between: linked pairs of different videos or photos.
@@ -32,7 +32,7 @@ class LinkReport:
     """
 
     num_images: int = 0
-    searched_all: bool = False
+    searched_loops: bool = False
     num_links: int = 0
     num_revisits: int = 0
     num_between: int = 0

@@ -14,6 +14,7 @@ from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.track_points import chaining_for_points, seen_in, triangulate_tracks
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.masks import mask_tracks
+from colmap_av1.images.track_images import MIN_IMAGES
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.dynamic.contradictions import place_tracks
 from colmap_av1.poses.dynamic.regions import dynamic_cells, mask_of_cells
@@ -60,8 +61,8 @@ def dynamic_stage(
                     found |= _dynamic_masks(run, tracks, placed, own)
                 run.progress("dynamic", video + 1, len(image_set.videos))
         _write(partial / _FILE, found)
-        left_out = sum(1.0 - mask.share for mask in found.values()) / len(placed.images)
-        return DynamicResult(left_out)
+        share = sum(1.0 - mask.share for mask in found.values()) / len(placed.images)
+        return DynamicResult(share)
 
     return run_stage(
         run.stages,
@@ -97,8 +98,11 @@ def without_dynamic_tracks(
     }
     if not by_frame:
         return tracks
-    options = chaining_for_points(run.options.match.tracks, run.options.triangulate)
-    return mask_tracks(tracks, by_frame, least_length(options), scaled=False)
+    min_length = MIN_IMAGES
+    if len(images.frames) == image_set.num_frames:  # else the length in frames is not known
+        options = chaining_for_points(run.options.match.tracks, run.options.triangulate)
+        min_length = least_length(options)
+    return mask_tracks(tracks, by_frame, min_length, scaled=False)
 
 
 def without_dynamic_links(
