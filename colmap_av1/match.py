@@ -628,7 +628,6 @@ def _match_pairs(
             )
             for own, fast in zip(videos, images.fast, strict=True)
         ],
-        images.inputs.no_motion,
         cameras,
         pictures_of(
             image_set, images.shown, [photo.path for photo in images.inputs.photos], options.reading

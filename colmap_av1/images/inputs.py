@@ -8,9 +8,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from colmap_av1.errors import OptionError, VideoError
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.choosing import ChosenImages
@@ -73,11 +70,6 @@ class Inputs:
             labels=tuple(itertools.compress(self.labels, kept)),
             warnings=(*self.warnings, f"the model has no image of {', '.join(left_out)}"),
         )
-
-    @property
-    def no_motion(self) -> NDArray[np.float32]:
-        """Shares of inter units of the photos, which are 0."""
-        return np.zeros(len(self.photos), np.float32)
 
     @property
     def masks_of_videos(self) -> list[VideoMasks | None]:

@@ -74,7 +74,6 @@ class ImageMatches:
 def match_images(
     image_set: ImageSet,
     videos: Sequence[SelectedTracks],
-    no_motion: NDArray[np.float32],
     cameras: Callable[[PairedImages], ImageCameras],
     pictures: Pictures,
     *,
@@ -88,7 +87,6 @@ def match_images(
     Args:
         image_set: the images.
         videos: the tracks of each video.
-        no_motion: float32 [num_photos] the inter shares of the photos.
         cameras: returns the cameras of the images, which may depend on the matches.
         pictures: returns the pictures of images, for links.
         options: options of pairs, verification and links.
@@ -106,13 +104,10 @@ def match_images(
         image_set,
         matched,
         made.of_images,
-        np.concatenate([*(video.inter_share for video in videos), no_motion]),
+        np.concatenate([video.inter_share for video in videos]),
         pictures,
         fast=np.concatenate(
-            [
-                *(own.fast[image_set.of_video(k).frames] for k, own in enumerate(videos)),
-                np.zeros(len(no_motion), np.bool_),
-            ]
+            [own.fast[image_set.of_video(k).frames] for k, own in enumerate(videos)]
         ),
         pairs=options.pairs,
         verify=options.verify,

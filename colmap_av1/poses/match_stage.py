@@ -224,7 +224,6 @@ def _match_images(
     return match_images(
         keyed,
         _selected_tracks(run, videos, keyed),
-        run.inputs.no_motion,
         cameras,
         run.pictures(keyed),
         options=options,

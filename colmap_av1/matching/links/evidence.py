@@ -69,7 +69,7 @@ def contradicted_gaps(
     return contradicted
 
 
-def confirmed_gaps(
+def unbridged_gaps(
     report: LinkReport, suspect: SuspectGaps, matched: MatchedImages, image_set: ImageSet
 ) -> Bools:
     """Find suspect gaps whose motion the first look contradicts, or that few tracks cross.
@@ -94,15 +94,15 @@ def confirmed_gaps(
     in_video = across[np.diff(image_set.sequence) == 0]
     usual = float(np.median(in_video)) if len(in_video) else 0.0
     enough = max(_SURE_INLIERS, _ENOUGH_OF_USUAL * usual)
-    confirmed = suspect.maybe & (is_wrong | (across < enough))
+    found = suspect.maybe & (is_wrong | (across < enough))
     wrong_probes = [int(image_set.sequence[gap]) for gap in suspect.probes if is_wrong[gap]]
     for sequence, count in enumerate(
         np.bincount(wrong_probes, minlength=image_set.num_sequences).tolist()
     ):
         if count >= _NUM_WRONG_PROBES:
             images = image_set.images_of(sequence)
-            confirmed[images.start : images.stop - 1] = True
-    return confirmed
+            found[images.start : images.stop - 1] = True
+    return found
 
 
 def gaps_after_linking(

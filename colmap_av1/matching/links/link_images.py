@@ -25,10 +25,10 @@ from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.sift import Features
 from colmap_av1.matching.gaps import suspect_gaps
 from colmap_av1.matching.links.evidence import (
-    confirmed_gaps,
     contradicted_gaps,
     gaps_after_linking,
     same_videos,
+    unbridged_gaps,
     with_parts,
 )
 from colmap_av1.matching.links.matching import (
@@ -105,9 +105,10 @@ def link_images(
         image_set: the images of videos and photos.
         matched: the images, matched along tracks.
         cameras: the camera of each image; images that share a camera hold the same object.
-        inter_share: float32 [num_frames], see `TrackedVideo`; any numbers for photos.
+        inter_share: float32 [n] share of inter units of each frame of the videos, one after the
+            other, see `TrackedVideo`.
         pictures: returns the pictures of images.
-        fast: bool [num_images] images around which the camera moves fast, see `fast_frames`.
+        fast: bool [m] images of the videos around which the camera moves fast, see `fast_frames`.
         pairs: offsets of neighbours in fast stretches, and fewest matches for messages.
         verify: how links are verified.
         links: whether and where images are linked.
@@ -152,7 +153,7 @@ def link_images(
         first = first_look(suspect, image_set)
         also = plan.wanted if plan.effort == "light" else []
         features_of([*first.wanted, *also], "light")  # decodes the videos only once
-        gaps = gaps | confirmed_gaps(link(first).report, suspect, matched, image_set)
+        gaps = gaps | unbridged_gaps(link(first).report, suspect, matched, image_set)
         plan = plan_links(image_set, matched, gaps, images_apart, links, fast=fast)
     if plan.wanted:
         linked = link(plan)

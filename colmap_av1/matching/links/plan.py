@@ -132,7 +132,7 @@ def plan_links(
         gaps: bool [num_images - 1] gaps that motion does not bridge.
         images_apart: see `link_images`.
         options: whether and where images are linked.
-        fast: bool [num_images] images around which the camera moves fast, see `fast_frames`.
+        fast: bool [n] images of the videos around which the camera moves fast, see `fast_frames`.
     """
     if options.links == "none":
         return Plan(np.empty(0, np.int64), [], [], [])
@@ -165,7 +165,7 @@ def plan_links(
 
 
 def _stretches(chosen: Bools, image_set: ImageSet) -> tuple[range, ...]:
-    """Ranges of consecutive images of one video where `chosen`, bool [num_images], is True."""
+    """Ranges of consecutive images of one video where `chosen`, bool [n], is True."""
     found: list[range] = []
     for video in range(len(image_set.videos)):
         images = image_set.images_of(video)
