@@ -15,7 +15,6 @@ import numpy as np
 
 from colmap_av1.errors import ColmapAv1Error, ModelError, writing
 from colmap_av1.geometry.cameras import focal_length_warning
-from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.geometry.track_points import LEAST_AGREEING
 from colmap_av1.geometry.uncertainty import expected_error, uncertainty_warning
 from colmap_av1.images.image_set import ImageSet, ShownVideo
@@ -28,6 +27,7 @@ from colmap_av1.options import MatchOptions, ReconstructOptions
 from colmap_av1.poses.estimate import estimate_poses
 from colmap_av1.poses.placing.placement import Place
 from colmap_av1.poses.posed import Posed
+from colmap_av1.poses.posed_images import read_poses
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import (
     encoding_for_pictures,
@@ -285,7 +285,7 @@ def _run_stages(run: Run) -> ReconstructReport:
     further, not_registered = further_models(run, posed, image_set)
     assert posed.long_range is not None
     matches, poses, model = posed.matches.result, posed.last.result, written.result
-    registered = read_posed_model(run.stages / poses.poses)
+    registered = read_poses(run, posed.last)
     with run.clock.measure("adjustment"):
         centre_error = expected_error(registered)
     further_warnings = (

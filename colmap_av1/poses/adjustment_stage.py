@@ -10,7 +10,7 @@ from colmap_av1.geometry.cameras import has_long_focal_length
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
-from colmap_av1.geometry.track_points import seen_in, to_model_points
+from colmap_av1.geometry.track_points import to_model_points
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.adjusting import adjust_posed, refines_intrinsics, without_unseen_images
@@ -181,6 +181,5 @@ def _triangulated_points(
     run: Run, placed: PosedImages, tracks: Tracks, options: TriangulateOptions
 ) -> ModelPoints:
     """Triangulated points of tracks in the registered images, without colours."""
-    seen, view = seen_in(tracks, placed.frames)
-    points = triangulate_in(run, placed, seen, view, options=options)
+    seen, view, points = triangulate_in(run, placed, tracks, options)
     return to_model_points(points, view, seen)

@@ -19,6 +19,7 @@ from colmap_av1.poses.posed import (
     split_at_seams,
     trusted_tracks,
 )
+from colmap_av1.poses.posed_images import read_poses
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import LEAST_IMAGES
 from colmap_av1.tracks.tracks import Tracks
@@ -76,7 +77,7 @@ def further_poses(
         left_out: gets the names of the images of models that are not used: too few tracks agree
             with their poses, their positions are uncertain, or they have too few images.
     """
-    first_model = read_posed_model(run.stages / first.last.result.poses)
+    first_model = read_poses(run, first.last)
     left = set(image_set.images.names) - first_model.by_name.keys()
     waiting = [_with_cameras_of(first_model, other) for other in _other_models(run, first)]
     number = 1
@@ -154,7 +155,7 @@ def _other_models(
 
 def _registered(run: Run, posed: Posed) -> set[str]:
     """The names of the registered images."""
-    return set(read_posed_model(run.stages / posed.last.result.poses).by_name)
+    return set(read_poses(run, posed.last).by_name)
 
 
 def _named(image_set: ImageSet, names: AbstractSet[str]) -> ImageSet:

@@ -17,8 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
-from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, reprojection_errors
-from colmap_av1.geometry.track_points import seen_in
+from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.mapper_limits import POINT_MIN_ANGLE
 from colmap_av1.matching.match_images import ImageMatches
@@ -37,7 +36,12 @@ from colmap_av1.poses.matched_observations import (
     matched_observations,
 )
 from colmap_av1.poses.posed import Posed
-from colmap_av1.poses.posed_images import PosedImages, posed_images_of, triangulate_in
+from colmap_av1.poses.posed_images import (
+    PosedImages,
+    posed_images_of,
+    read_poses,
+    triangulate_in,
+)
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.starting_pair import StartingPair, starting_pair
 from colmap_av1.poses.track_matches import at_same_place, pair_by_tracks, tracks_of_model
@@ -228,7 +232,7 @@ class _Model:
 def _model_of(run: Run, posed: Posed, image_set: ImageSet) -> _Model:
     """The finished model of a run, with those of its images that are in the set."""
     assert posed.adjustment is not None  # `match` always adjusts
-    known = read_posed_model(run.stages / posed.last.result.poses)
+    known = read_poses(run, posed.last)
     placed = posed_images_of(known, image_set)
     tracks = pose_tracks(run, posed.tracks).keep_frames(placed.frames)
     return _Model(run, posed.adjustment.result, known, placed, tracks)
@@ -304,8 +308,7 @@ def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, Float
 
 def _agreeing_motion(run: Run, tracks: Tracks, placed: PosedImages) -> tuple[Tracks, Floats]:
     """Motion tracks that have a point, without outliers, and their points."""
-    seen, view = seen_in(tracks, placed.frames)
-    points = triangulate_in(run, placed, seen, view, options=_POINTS)
+    seen, _, points = triangulate_in(run, placed, tracks, _POINTS)
     return seen.take(points.observation, points.offsets), points.xyz
 
 

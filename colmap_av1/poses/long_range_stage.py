@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from colmap_av1.geometry.masks import Mask
-from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.long_range import LongRangeCheck, LongRangeErrors
 from colmap_av1.poses.posed_images import (
@@ -115,8 +114,7 @@ def _compared(
 def _points_by_image(run: Run, tracks: Tracks, placed: PosedImages) -> list[Floats]:
     """Float64 [n, 3] some points that each image observes."""
     some = tracks.every_nth(max(1, tracks.num_tracks // _NUM_TRACKS))
-    seen, view = seen_in(pose_tracks(run, some), placed.frames)
-    points = triangulate_in(run, placed, seen, view, options=FOR_POSES)
+    _, view, points = triangulate_in(run, placed, pose_tracks(run, some), FOR_POSES)
     xyz = np.repeat(points.xyz, np.diff(points.offsets), axis=0)
     order, bounds = grouped(view[points.observation], len(placed.images))
     return np.split(xyz[order], bounds[1:-1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -51,7 +52,7 @@ def mapping_stage(
     run: Run, matched: Kept[MatchesResult], image_set: ImageSet, keyed: ImageSet
 ) -> Kept[MappedResult]:
     """Estimate the poses of the key images with COLMAP's mapper."""
-    options, clock, progress = run.options, run.clock, run.progress
+    options, clock = run.options, run.clock
     mapping = options.mapping
     found_before = matched.result
     forward = found_before.forward_motion
@@ -79,25 +80,6 @@ def mapping_stage(
         for mapper in mappers
     ]
 
-    def map_with(map_options: MapOptions, database: Path) -> list[PosedModel]:
-        with tempfile.TemporaryDirectory() as models:
-            sizes = map_poses(
-                database,
-                Path(models),
-                map_options,
-                image_path=None,
-                log=run.stages / "mapper.log",
-                num_images=len(keyed.images.names),
-                progress=progress,
-                effort=effort,
-            )
-            found = [
-                posed_model(read_model(Path(models) / str(number)), with_points=True)
-                for number, size in enumerate(sizes)
-                if size >= LEAST_IMAGES
-            ]
-        return [with_second_distortion(run, model) for model in found]
-
     def make(partial: Path) -> MappedResult:
         with clock.measure("poses"):
             for attempt in attempts:
@@ -107,7 +89,7 @@ def mapping_stage(
                 if attempt.mapper == "global" and mapping.adjust:
                     keep_start_tracks(database)
                 try:
-                    found = map_with(attempt, database)
+                    found = mapped_models(run, database, attempt, effort, keyed.images.names)
                 except ModelError:
                     if attempt is attempts[-1]:
                         raise
@@ -117,6 +99,7 @@ def mapping_stage(
         if not found:
             camera = options.match.camera
             raise ModelError(_why_no_initial_pair(found_before, attempt.mapper, camera))
+        found = [with_second_distortion(run, model) for model in found]
         # Further images belong to the model of their nearest key image.
         found.sort(key=lambda model: -num_nearest(model, image_set, keyed))
         (partial / "poses").mkdir()
@@ -143,6 +126,39 @@ def mapping_stage(
         products=["poses"],
         make=make,
     )
+
+
+def mapped_models(
+    run: Run, database: Path, options: MapOptions, effort: MapperEffort, names: Sequence[str]
+) -> list[PosedModel]:
+    """Map a database, and read the models of more than a few images, with their points.
+
+    Args:
+        run: the run.
+        database: the database, which pycolmap may change.
+        options: options of the mapper.
+        effort: see `map_poses`.
+        names: names of its images.
+
+    Raises:
+        ModelError: the mapper fails.
+    """
+    with tempfile.TemporaryDirectory() as models:
+        sizes = map_poses(
+            database,
+            Path(models),
+            options,
+            image_path=None,
+            log=run.stages / "mapper.log",
+            num_images=len(names),
+            progress=run.progress,
+            effort=effort,
+        )
+        return [
+            posed_model(read_model(Path(models) / str(number)), with_points=True)
+            for number, size in enumerate(sizes)
+            if size >= LEAST_IMAGES
+        ]
 
 
 def num_nearest(model: PosedModel, image_set: ImageSet, keyed: ImageSet) -> int:

@@ -24,11 +24,12 @@ from typing import Any
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 
 from colmap_av1.geometry.colmap_model import camera_centres
-from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
+from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
 from colmap_av1.geometry.uncertainty import MAX_CERTAIN_ERROR, MAX_IMAGES, centre_uncertainty
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.mapping_stage import MappedResult
+from colmap_av1.poses.posed_images import read_poses
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.seams import least_depth_angle, ray_angle
 from colmap_av1.poses.unconfirmed_seams import unconfirmed_seams
@@ -81,7 +82,7 @@ def split_stage(
     """
 
     def parts(known: PosedModel) -> list[AbstractSet[str]]:
-        other = read_posed_model(run.stages / rival.result.poses) if rival is not None else None
+        other = read_poses(run, rival) if rival is not None else None
         few = adjusted.result.few_point_seams
         unconfirmed = unconfirmed_seams(known, image_set, tracks, seams, few)
         return parts_of(known, image_set, seams, unconfirmed=unconfirmed, rival=other)
@@ -130,7 +131,7 @@ def _parts_stage(
     """
 
     def make(partial: Path) -> MappedResult:
-        known = read_posed_model(run.stages / adjusted.result.poses)
+        known = read_poses(run, adjusted)
         parts = parts_of_model(known)
         (partial / name).mkdir()
         files = [f"{name}/{part}.npz" for part in range(len(parts))]

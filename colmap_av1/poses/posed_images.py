@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,14 +14,13 @@ from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, joined_masks
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model
-from colmap_av1.geometry.track_points import triangulate_tracks
+from colmap_av1.geometry.track_points import seen_in, triangulate_tracks
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import TriangulateOptions
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.arrays import Floats, Ints
-from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.util.arrays import Ints
 from colmap_av1.util.stages import Kept
 
 # For pose estimation even points of uncertain depth are useful, so their depth error is unlimited.
@@ -77,9 +76,14 @@ class PosedImages:
         ]
 
 
+def read_poses(run: Run, posed: Kept[PosesResult]) -> PosedModel:
+    """The model of a stage."""
+    return read_posed_model(run.stages / posed.result.poses)
+
+
 def read_posed_images(run: Run, posed: Kept[PosesResult], image_set: ImageSet) -> PosedImages:
     """The registered images of a stage."""
-    return posed_images_of(read_posed_model(run.stages / posed.result.poses), image_set)
+    return posed_images_of(read_poses(run, posed), image_set)
 
 
 def posed_images_of(poses: PosedModel, image_set: ImageSet) -> PosedImages:
@@ -95,27 +99,23 @@ def posed_images_of(poses: PosedModel, image_set: ImageSet) -> PosedImages:
 
 
 def triangulate_in(
-    run: Run,
-    placed: PosedImages,
-    seen: Tracks,
-    view: Ints,
-    *,
-    options: TriangulateOptions,
-    pinholes: Sequence[pycolmap.Camera] | None = None,
-    rays: Floats | None = None,
-    progress: Progress = no_progress,
-) -> TriangulatedPoints:
-    """Triangulate tracks in the registered images, see `triangulate_tracks`."""
-    return triangulate_tracks(
+    run: Run, placed: PosedImages, tracks: Tracks, options: TriangulateOptions
+) -> tuple[Tracks, Ints, TriangulatedPoints]:
+    """Triangulate tracks in the registered images.
+
+    Returns:
+        The observations of the tracks in these images; int64 [num_observations] the index of the
+        image of each; and the points, see `triangulate_tracks`.
+    """
+    seen, view = seen_in(tracks, placed.frames)
+    points = triangulate_tracks(
         seen,
         view,
         [PosedCamera(placed.cameras[i.camera_id], i.cam_from_world) for i in placed.images],
         options=options,
         num_threads=run.context.num_threads,
-        pinholes=pinholes,
-        rays=rays,
-        progress=progress,
     )
+    return seen, view, points
 
 
 def check_agreement(num_points: int, num_tracks: int) -> None:

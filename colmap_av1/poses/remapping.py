@@ -26,26 +26,23 @@ import pycolmap
 from colmap_av1.database.writing import write_matches
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.cameras import with_initial_intrinsics
-from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.geometry.posed_model import (
     PosedModel,
-    posed_model,
-    read_posed_model,
     reprojection_errors,
     write_posed_model,
 )
-from colmap_av1.geometry.track_points import seen_in, to_model_points
+from colmap_av1.geometry.track_points import to_model_points
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.matched_images import verify_images
 from colmap_av1.matching.pairs import covisible_pairs
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.adjusting import adjust_posed, mean_cost, refines_intrinsics
 from colmap_av1.poses.adjustment_stage import AdjustedResult
-from colmap_av1.poses.mapper import map_poses
-from colmap_av1.poses.mapping_stage import MappedResult
+from colmap_av1.poses.mapping_stage import MappedResult, mapped_models
 from colmap_av1.poses.posed_images import (
     FROM_PICTURES,
     posed_images_of,
+    read_poses,
     triangulate_in,
 )
 from colmap_av1.poses.run import Run
@@ -120,7 +117,7 @@ def remap_stage(
     from_initial = adjusted.result.has_long_focal_length
 
     def make(partial: Path) -> RemappedResult:
-        known = read_posed_model(run.stages / adjusted.result.poses)
+        known = read_poses(run, adjusted)
         tracks = tracks_of_model(known, image_set)
         with run.clock.measure("poses"):
             start = known
@@ -179,29 +176,22 @@ def _map_tracks(
     min_matches = options.match.pairs.min_matches
     paired = pair_by_tracks(tracks, frames, lambda own: covisible_pairs(own, min_matches))
     matched = verify_images(paired, cameras, options.match.verify, run.context)
+    names = [image.name for image in known.images]
+    map_options = MapOptions(
+        mapper="global",
+        refine_intrinsics=refines_intrinsics(options),
+        seed=run.context.seed,
+        num_threads=options.mapping.mapper_threads,
+    )
     with tempfile.TemporaryDirectory() as folder:
-        database, models = Path(folder) / "database.db", Path(folder) / "models"
-        write_matches(database, [i.name for i in known.images], cameras, matched)
+        database = Path(folder) / "database.db"
+        write_matches(database, names, cameras, matched)
         keep_start_tracks(database)
         try:
-            sizes = map_poses(
-                database,
-                models,
-                MapOptions(
-                    mapper="global",
-                    refine_intrinsics=refines_intrinsics(options),
-                    seed=run.context.seed,
-                    num_threads=options.mapping.mapper_threads,
-                ),
-                image_path=None,
-                log=run.stages / "mapper.log",
-                num_images=len(known.images),
-                progress=run.progress,
-                effort="early",
-            )
+            found = mapped_models(run, database, map_options, "early", names)
         except ModelError:  # the first mapping is there
             return None
-        return _with_camera_ids(posed_model(read_model(models / "0")), known) if sizes else None
+    return _with_camera_ids(found[0], known) if found else None
 
 
 def _with_camera_ids(found: PosedModel, known: PosedModel) -> PosedModel:
@@ -234,8 +224,7 @@ def _costs(
     """
     placed = posed_images_of(found, image_set)
     in_both = np.isin(tracks.frame, placed.frames)
-    seen, view = seen_in(tracks, placed.frames)
-    agreeing = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
+    seen, view, agreeing = triangulate_in(run, placed, tracks, FROM_PICTURES)
     if len(agreeing.xyz) == 0:
         return 0.0, 0.0, 0.0
     points = to_model_points(agreeing, view, seen)

@@ -9,7 +9,6 @@ import numpy as np
 from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
 from colmap_av1.geometry.resection import interpolate_poses, resect, sightings_of
-from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import DensityOptions
 from colmap_av1.poses.posed_images import (
@@ -61,8 +60,7 @@ def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -
     """The key images with a pose, and the images between them that get one."""
     seen_thrice = pose_tracks(run, tracks).keep_observed_in(known.frames, _FEWEST_VIEWS)
     spread = select_tracks(seen_thrice.keep_frames(image_set.images.frames), _RESECTED)
-    seen, view = seen_in(spread, known.frames)
-    points = triangulate_in(run, known, seen, view, options=FOR_POSES)
+    seen, _, points = triangulate_in(run, known, spread, FOR_POSES)
     check_agreement(len(points.xyz), points.num_tracks)
     pose_of = {
         frame: (image.camera_id, image.cam_from_world)

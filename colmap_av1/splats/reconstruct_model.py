@@ -23,6 +23,7 @@ from colmap_av1.geometry.track_points import (
     rays_of,
     seen_in,
     to_model_points,
+    triangulate_tracks,
 )
 from colmap_av1.geometry.undistortion import (
     Undistortion,
@@ -39,7 +40,6 @@ from colmap_av1.poses.posed_images import (
     PosesResult,
     check_agreement,
     read_posed_images,
-    triangulate_in,
 )
 from colmap_av1.poses.run import Run
 from colmap_av1.splats.gaussians import remove_gaussians_in
@@ -64,12 +64,12 @@ def _tracked_points(
     seen, view = seen_in(tracks, placed.frames)
     rays = rays_of(seen, view, placed.camera_of_image)
     cameras = [own.camera for own in views]
-    points = triangulate_in(
-        run,
-        placed,
+    points = triangulate_tracks(
         seen,
         view,
+        [PosedCamera(placed.cameras[i.camera_id], i.cam_from_world) for i in placed.images],
         options=run.options.triangulate,
+        num_threads=run.context.num_threads,
         pinholes=cameras,
         rays=rays,
         progress=run.progress,

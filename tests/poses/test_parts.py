@@ -21,6 +21,7 @@ from colmap_av1.poses.parts import certain_parts, parts_of
 from colmap_av1.poses.track_matches import tracks_of_model
 from colmap_av1.poses.unconfirmed_seams import unconfirmed_seams
 from colmap_av1.reconstruct import reconstruct
+from colmap_av1.tracks.tracks import Tracks
 
 
 def model(image_set: ImageSet, views: list[list[int]]) -> PosedModel:
@@ -143,9 +144,23 @@ def test_a_seam_is_unconfirmed_if_most_tracks_do_not_fit(share: float) -> None:
     contradicted = seams if share < 0.4 else []
     for few_points in ([], seams):
         assert unconfirmed_seams(known, image_set, tracks, seams, few_points) == contradicted
-    few = tracks.keep_tracks(np.arange(tracks.num_tracks) < 20)
-    assert unconfirmed_seams(known, image_set, few, seams, []) == []
-    assert unconfirmed_seams(known, image_set, few, seams, seams) == seams
+
+
+@pytest.mark.parametrize(("jump", "is_unconfirmed"), [(1, False), (8, False), (30, True)])
+def test_a_seam_without_tracks_is_unconfirmed_if_the_camera_is_too_fast(
+    jump: int, is_unconfirmed: bool
+) -> None:
+    """Five images are lost at the seam."""
+    every = images(24)
+    image_set = every.some([*range(10), *range(15, 24)])
+    known = model(image_set, [[0, 1]])
+    for number, image in enumerate(known.images):
+        image.cam_from_world[0, 3] = -number - (jump if number >= 10 else 0)
+    seams = [(image_set.images.names[9], image_set.images.names[10])]
+    nothing = Tracks.empty(24, (640, 480))
+    assert unconfirmed_seams(known, every, nothing, seams, []) == []
+    expected = seams if is_unconfirmed else []
+    assert unconfirmed_seams(known, every, nothing, seams, seams) == expected
 
 
 def test_another_video_joins_parts() -> None:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.coverage import views_of
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.resection import resect, sightings_of
-from colmap_av1.geometry.track_points import seen_in
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.patch_matching import match_patches
 from colmap_av1.poses.posed_images import FROM_PICTURES, PosedImages, triangulate_in
@@ -96,8 +95,7 @@ def _match_in_all(
     pictures: GreyPictures,
 ) -> Tracks:
     """Locate corners in all images that see them, see `match_patches`."""
-    seen, view = seen_in(corners, placed.frames)
-    points = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
+    seen, view, points = triangulate_in(run, placed, corners, FROM_PICTURES)
     views = views_of(placed.images, placed.cameras, masks)
     report = progress_in(run.progress, "refinement", len(views))
     return match_patches(
@@ -123,8 +121,7 @@ def resect_from_corners(run: Run, corners: Tracks, placed: PosedImages) -> Posed
         corners: corners as tracks.
         placed: the registered images.
     """
-    seen, view = seen_in(corners, placed.frames)
-    points = triangulate_in(run, placed, seen, view, options=FROM_PICTURES)
+    seen, _, points = triangulate_in(run, placed, corners, FROM_PICTURES)
     if len(points.xyz) == 0:
         return placed
     images = list(placed.images)
