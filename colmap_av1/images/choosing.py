@@ -315,9 +315,8 @@ def _find_existing(
 ) -> ChosenImages:
     """Find the frames of existing images."""
     by_name = [names[i] for i in natural_order(names)]
-    files = [image_file(folder, name) for name in by_name] if folder is not None else []
-    if not all(file.exists() for file in files):
-        files = []
+    file_of = {name: image_file(folder, name) for name in by_name} if folder is not None else {}
+    file_of = {name: file for name, file in file_of.items() if file.exists()}
     if options.frame_list is not None:
         chosen = read_frame_list(options.frame_list, num_frames, options)
         if of_model:
@@ -335,17 +334,28 @@ def _find_existing(
     else:
         try:
             frames = frames_of_images(by_name, num_frames, options.first_number)
-        except ImageError:
-            if options.first_number is not None or not files:
+        except ImageError as error:
+            if options.first_number is not None or not file_of:
                 raise
-            return _by_content(by_name, files, decode)
+            missing = [name for name in by_name if name not in file_of]
+            if missing:
+                raise ImageError(
+                    f"{folder}: lacks {len(missing)} of the {len(names)} images, such as "
+                    f"'{missing[0]}', so that content does not identify them: restore these files, "
+                    "or list the images in a --frame_list"
+                ) from error
+            return _by_content(by_name, list(file_of.values()), decode)
         chosen = _in_order(by_name, frames)
-    if files:
+    there = [k for k, name in enumerate(chosen.names) if name in file_of]
+    if there:
         # A wrong start or rate shows at the first or the last image.
-        ends = sorted({0, len(chosen.names) - 1})
-        paths = [image_file(folder or Path(), chosen.names[k]) for k in ends]
+        ends = sorted({there[0], there[-1]})
         frames_of_ends = chosen.frames[ends].tolist()
-        check_content(paths, frames_of_ends, decode(frames_near(frames_of_ends)))
+        check_content(
+            [file_of[chosen.names[k]] for k in ends],
+            frames_of_ends,
+            decode(frames_near(frames_of_ends)),
+        )
     return chosen
 
 

@@ -446,14 +446,18 @@ def _mark_of(stream: Path) -> dict[str, str] | None:
 
 
 def _fits(mark: Mapping[str, str], video: Path, options: EncodeOptions) -> bool:
-    """Whether a kept stream was made from the video with these options."""
+    """Whether a kept stream was made from the video with these options; 'auto' is any encoder."""
     if mark.get("encoder") not in ENCODERS or mark.get("source") != _source(video):
         return False
-    encoder = None if options.encoder == "auto" else options.encoder
-    speed = options.speed
-    if speed is None and options.effort == "full":
-        speed = ENCODERS[mark["encoder"]].speed
-    wanted = {"encoder": encoder, "quality": options.quality, "speed": speed}
-    if mark.get("downscale", "1.0") != str(float(options.downscale or 1)):
+    encoder = ENCODERS[mark["encoder"]]
+    if options.encoder not in ("auto", mark["encoder"]):
         return False
-    return all(mark.get(key) == str(value) for key, value in wanted.items() if value is not None)
+    quality, speed = settings(encoder, options)
+    speeds = {speed}
+    if options.speed is None and options.effort != "full":
+        speeds = {encoder.speed, encoder.quick_speed}
+    return (
+        mark.get("quality") == str(quality)
+        and mark.get("speed") in {str(own) for own in speeds}
+        and mark.get("downscale", "1.0") == str(float(options.downscale or 1))
+    )

@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from conftest import Encode, Ffmpeg, make_frames
 from databases import keypoints_of
@@ -371,6 +372,28 @@ def test_every_applies_to_existing_images(
     with pytest.raises(OptionError, match="num_images"):
         run("c.db", num_images=3)
     assert not (tmp_path / "c.db").exists()
+
+
+def test_content_is_checked_if_images_are_missing(
+    clip: Path, cut: list[np.ndarray], tmp_path: Path
+) -> None:
+    folder = save(tmp_path / "step", cut[::3])
+    database = tmp_path / "a.db"
+    pycolmap.Database.open(database).close()
+    pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE)
+    (folder / "x1.png").unlink()
+    before = database.read_bytes()
+    with pytest.raises(ImageError, match="frame 10"):
+        match(database, clip, image_path=folder, options=_every(2))
+    with pytest.raises(ImageError, match=r"x1\.png"):
+        match(database, clip, image_path=folder, options=DENSE)
+    assert database.read_bytes() == before
+    assert not (folder / "x1.png").exists()
+    assert match(database, clip, image_path=folder, options=_every(3)).num_written_images == 1
+
+
+def _every(step: int) -> MatchOptions:
+    return replace(DENSE, images=ImageOptions(every=step))
 
 
 @pytest.mark.parametrize("choice", [{"fps": 10}, {"frame_list": "list.txt"}])

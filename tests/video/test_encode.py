@@ -230,6 +230,11 @@ def test_stream_is_reused_until_the_settings_or_the_video_change(
     assert stream_of(video, stream, options=EncodeOptions(quality=20)).reused
     assert not stream_of(video, stream, options=EncodeOptions(quality=40)).reused
     assert not stream_of(video, stream, options=EncodeOptions(quality=20)).reused
+    # The options that are left out have their defaults again.
+    assert not stream_of(video, stream, options=EncodeOptions(quality=60)).reused
+    assert not stream_of(video, stream).reused
+    assert not stream_of(video, stream, options=EncodeOptions(speed=8)).reused
+    assert not stream_of(video, stream).reused
     assert first.output.read_bytes() == bytes_before
     # A truncated stream is not recognized as one of this package, so it is not replaced.
     first.output.write_bytes(bytes_before[: len(bytes_before) // 2])
