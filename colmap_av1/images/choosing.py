@@ -102,6 +102,8 @@ def existing_images(
             stacklevel=2,
         )
     names = sorted((p.name for p in found if p.suffix.lower() in READABLE), key=natural_key)
+    if not names:
+        _warn_of_subfolders(root)
     is_own = image_names(options.file_name, [0])[0] in names
     if options.is_spread:
         regex = pattern_regex(options.file_name)
@@ -111,6 +113,18 @@ def existing_images(
         listed = {name for *_, name in _read_entries(options.frame_list, options)}
         is_own |= {*names} < listed and image_size(root / names[0]) == size
     return [] if is_own else names
+
+
+def _warn_of_subfolders(root: Path) -> None:
+    """Warn if the images of a folder are in its subfolders, where those of one video are not."""
+    deeper = (p.relative_to(root) for p in root.glob("*/*") if p.suffix.lower() in READABLE)
+    first = next((p for p in sorted(deeper) if not str(p).startswith(".")), None)
+    if first is not None:
+        warnings.warn(
+            f"{root}: ignored images in subfolders, such as {first}: give '{root / first.parent}' "
+            "to use them",
+            stacklevel=3,
+        )
 
 
 def choose_images(

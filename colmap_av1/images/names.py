@@ -96,8 +96,10 @@ def frames_of_images(
         )
     if len(set(found)) < len(found):
         twice = next(number for number in found if found.count(number) > 1)
+        first, second, *_ = (n for n, own in zip(names, found, strict=True) if own == twice)
         raise ImageError(
-            f"two images have the frame number {twice}: list their frames in a --frame_list"
+            f"'{first}' and '{second}' have the same frame number {twice}: list the images in a "
+            "--frame_list, or give the videos of all folders in one run"
         )
     return np.array([number - first_number for number in found], dtype=np.int32)
 

@@ -162,5 +162,6 @@ def check_extension(name: str) -> None:
     """
     if PurePosixPath(name).suffix.lower() not in IMAGE_EXTENSIONS:
         raise OptionError(
-            f"image name '{name}' has no image extension: give one that ends in .png, .jpg or .jpeg"
+            f"image name '{name}' is not that of a PNG or JPEG file: give one that ends in .png, "
+            ".jpg or .jpeg"
         )

@@ -219,6 +219,12 @@ def model_long_range_errors(
     posed = posed_images(reconstruction)
     names = list(posed)
     images = [posed[names[k]] for k in natural_order(names)]
+    missing = next((name for name in names if not image_file(image_path, name).is_file()), None)
+    if missing is not None:
+        raise ImageError(
+            f"{image_path}: lacks the model's image '{missing}': give the folder of the model's "
+            "images"
+        )
 
     def points_of(index: int) -> Floats:
         seen = reconstruction.images[images[index].image_id].points2D

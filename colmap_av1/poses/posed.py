@@ -337,7 +337,6 @@ def split_at_seams(
         other stages must not be used.
     """
     may_bend = only_certain
-    tracks = posed.tracks  # those of later parts are cut at all their seams
     for number in count(_FIRST_SPLIT):
         if posed.adjustment is None:
             break
@@ -351,7 +350,7 @@ def split_at_seams(
                 posed.mapped,
                 posed.adjustment,
                 seams,
-                tracks=tracks,
+                tracks=posed.tracks,
                 rival=posed.rival,
                 number=number,
             )
