@@ -12,7 +12,7 @@ import pycolmap
 
 from colmap_av1.check.model_figures import model_figures
 from colmap_av1.errors import ColmapAv1Error, ImageError, ModelError, OptionError
-from colmap_av1.evaluate.frontends.footage import Footage, choose_footage
+from colmap_av1.evaluate.frontends.footage import Conversion, Footage, choose_footage, convert
 from colmap_av1.evaluate.frontends.frontend import Frontend, run_frontend
 from colmap_av1.evaluate.frontends.imported import imported_frontend
 from colmap_av1.evaluate.frontends.mapping import densify_model, measure_mapper
@@ -119,6 +119,7 @@ def compare(
     video = read_video(video, options.match.read.operating_point)
     check_is_plane(video.path, video.projection, video.picture_size[0])
     with open_stages(output, "compare"), writing_stages(output):
+        conversion = convert(video, output / "conversion", options.match, progress)
         footage = choose_footage(
             video,
             output / "footage",
@@ -138,6 +139,7 @@ def compare(
                 frontend,
                 footage,
                 output / _FRONTENDS / name,
+                conversion=conversion,
                 settings=settings,
                 options=options,
                 progress=progress,
@@ -221,6 +223,7 @@ def _run_column(
     footage: Footage,
     folder: Path,
     *,
+    conversion: Conversion | None,
     settings: MapOptions,
     options: CompareOptions,
     progress: Progress,
@@ -229,21 +232,27 @@ def _run_column(
     own = name.startswith(f"{_OWN}-") or name == _OWN
     total = 3 if own and options.all_tracks else 2
     column = Column(name)
+    if own and conversion is not None:  # the others need no AV1 stream
+        column = replace(
+            column,
+            seconds={"encoding": conversion.seconds},
+            cpu_seconds={"conversion": conversion.cpu_seconds},
+        )
     progress(name, 0, total)
     try:
         run = run_frontend(name, footage, folder / "matches", frontend)
         column = replace(
             column,
             warnings=run.warnings,
-            seconds=run.seconds,
-            cpu_seconds={"matching": run.cpu_seconds},
+            seconds={**run.seconds, **column.seconds},
+            cpu_seconds={**column.cpu_seconds, "matching": run.cpu_seconds},
             peak_memory=run.peak_memory,
         )
         progress(name, 1, total)
         mapped = measure_mapper(run.database, footage.image_path, folder / "mapped", settings)
         column = replace(
             column,
-            seconds={**run.seconds, "mapping": mapped.seconds},
+            seconds={**column.seconds, "mapping": mapped.seconds},
             cpu_seconds={**column.cpu_seconds, "mapping": mapped.cpu_seconds},
             peak_memory=_larger(run.peak_memory, mapped.peak_memory),
             num_models=mapped.num_models,

@@ -360,6 +360,20 @@ def test_existing_images_are_compared_without_a_reference(compared, video, tmp_p
     assert not (report.output / "footage" / "images").exists()
 
 
+@pytest.mark.slow
+def test_conversion_counts_as_cost_of_motion(video, ffmpeg, tmp_path):
+    other = ffmpeg("-i", video, "-c:v", "libx264", tmp_path / "h264.mp4")
+    options = CompareOptions(match=OPTIONS, frontends=("av1", "sift-sequential"), all_tracks=False)
+    report = compare(other, tmp_path / "report", options=options)
+    motion, sift = report.columns
+    assert 0 < motion.cpu_seconds["conversion"] < sum(motion.cpu_seconds.values())
+    assert "conversion" not in sift.cpu_seconds
+    # A run that keeps the stream keeps its cost.
+    fewer = replace(options, match=replace(OPTIONS, images=ImageOptions(every=8)))
+    (again, _) = compare(other, tmp_path / "report", options=fewer).columns
+    assert again.cpu_seconds["conversion"] == motion.cpu_seconds["conversion"]
+
+
 def test_failed_training_has_its_own_exit_status(video, tmp_path, monkeypatch, capsys):
     error = "the trainer ended with status 1: see log"
     model = SimpleNamespace(num_registered=2, num_points=9, coverage=0.5, mean_error=0.3)

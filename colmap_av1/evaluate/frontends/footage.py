@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ from colmap_av1.options import (
 )
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import least_length
+from colmap_av1.tracks.video_tracks import open_source
+from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
@@ -54,6 +56,51 @@ class Footage:
     camera: CameraOptions
     forward_motion: bool = False
     warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """The cost of converting a video to AV1.
+
+    Attributes:
+        seconds: wall time.
+        cpu_seconds: CPU time.
+    """
+
+    seconds: float
+    cpu_seconds: float
+
+
+def convert(
+    video: Video, folder: Path, options: MatchOptions, progress: Progress = no_progress
+) -> Conversion | None:
+    """Convert a video to AV1 and keep the stream, unless it is there already.
+
+    Args:
+        video: the video.
+        folder: folder for the cost, which is measured once.
+        options: only those of reading and encoding, and `keep_stream`, are used.
+        progress: called with the stage "encoding".
+
+    Returns:
+        The cost, small if an earlier run of another command kept the stream; None if the video is
+        AV1.
+
+    Raises:
+        ColmapAv1Error: see `match`.
+    """
+
+    def make() -> dict[str, Any]:
+        context = RunContext.of(options.run, progress=progress)
+        start = cpu_seconds()
+        with open_source(video, options.source, next_to=folder, context=context) as source:
+            is_converted = source.conversion is not None
+        cost = Conversion(context.clock.seconds.get("encoding", 0.0), cpu_seconds() - start)
+        return {"cost": asdict(cost) if is_converted else None}
+
+    depends_on = [file_digest(video.path), options.read, options.encode, options.reencode]
+    found = run_stage_in(folder, depends_on, make, products=[], timed=True).result["cost"]
+    return Conversion(**found) if found is not None else None
 
 
 def choose_footage(

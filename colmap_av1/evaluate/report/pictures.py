@@ -111,7 +111,12 @@ def bar_charts(report: CompareReport) -> bytes:
 
 def cost_chart(columns: Sequence[Column]) -> bytes:
     """Stacked bars of the CPU time of every front-end, as SVG."""
-    shades = {"matching": "#334155", "mapping": "#94a3b8", "all tracks": "#5aa0c8"}
+    shades = {
+        "conversion": "#b45309",
+        "matching": "#334155",
+        "mapping": "#94a3b8",
+        "all tracks": "#5aa0c8",
+    }
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(10, 0.9 + 0.27 * len(columns)), layout="constrained")
         axis: Any = figure.subplots()

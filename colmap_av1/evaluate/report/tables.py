@@ -140,23 +140,23 @@ def published_table(report: CompareReport) -> Table:
 
 def cost_table(columns: Sequence[Column]) -> Table:
     """CPU time, wall time and memory of each front-end."""
-    header = ["front-end", "matching, CPU s", "mapping, CPU s", "all tracks, CPU s", "total, CPU s"]
+    stages = ("conversion", "matching", "mapping", "all tracks")
+    header = ["front-end", *(f"{stage}, CPU s" for stage in (*stages, "total"))]
     header += ["peak memory", "wall time of each stage, s"]
     rows = []
     for column in columns:
         cpu = column.cpu_seconds
         row = [column.name]
-        row += [
-            f"{cpu[s]:.1f}" if s in cpu else _NONE for s in ("matching", "mapping", "all tracks")
-        ]
+        row += [f"{cpu[stage]:.1f}" if stage in cpu else _NONE for stage in stages]
         row.append(f"{sum(cpu.values()):.1f}" if cpu else _NONE)
         memory = column.peak_memory
         row.append(f"{memory / 2**20:,.0f} MB" if memory is not None else _NONE)
         row.append(", ".join(f"{k} {v:.1f}" for k, v in column.seconds.items()) or _NONE)
         rows.append(row)
     about = (
-        "Every stage ran in a separate process; matching includes reading or extraction, matching "
-        "and verification. If the machine was running other work at the same time, compare CPU "
+        "Motion needs a conversion to AV1 if the video has another codec. Every other stage ran in "
+        "a separate process; matching includes reading or extraction, matching and "
+        "verification. If the machine was running other work at the same time, compare CPU "
         "times, not wall times."
     )
     return Table("Time and memory", about, header, rows)
