@@ -28,11 +28,11 @@ from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
 from colmap_av1.geometry.uncertainty import MAX_CERTAIN_ERROR, MAX_IMAGES, centre_uncertainty
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.adjustment_stage import AdjustedResult
+from colmap_av1.poses.false_links import contradicted_seams, jumping_seams
 from colmap_av1.poses.mapping_stage import MappedResult
 from colmap_av1.poses.posed_images import read_poses
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.seams import least_depth_angle, ray_angle
-from colmap_av1.poses.unconfirmed_seams import unconfirmed_seams
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.graphs import connected_components
@@ -83,9 +83,14 @@ def split_stage(
 
     def parts(known: PosedModel) -> list[AbstractSet[str]]:
         other = read_poses(run, rival) if rival is not None else None
+        false = contradicted_seams(known, image_set, tracks, seams)
+        found = parts_of(known, image_set, seams, false=false, rival=other)
+        if len(found[0]) < len(known.images):
+            return found
+        # Only now, because images that are misplaced beside a seam are dropped first.
         few = adjusted.result.few_point_seams
-        unconfirmed = unconfirmed_seams(known, image_set, tracks, seams, few)
-        return parts_of(known, image_set, seams, unconfirmed=unconfirmed, rival=other)
+        false += jumping_seams(known, image_set, tracks, few)
+        return parts_of(known, image_set, seams, false=false, rival=other)
 
     key = [list(seams), rival.digest if rival is not None else None]
     return _parts_stage(run, mapped, adjusted, parts, name=f"parts_{number}", key=key)
@@ -199,22 +204,22 @@ def parts_of(
     image_set: ImageSet,
     seams: Sequence[tuple[str, str]],
     *,
-    unconfirmed: Sequence[tuple[str, str]] = (),
+    false: Sequence[tuple[str, str]] = (),
     rival: PosedModel | None = None,
 ) -> list[AbstractSet[str]]:
     """The names of the images of each part of a model, the largest part first.
 
     The images between two seams of a video form a stretch. Stretches belong to the same part if
     they have enough common points that have depth in each without the views of the other: these
-    determine their relative scale. No points join the stretches on either side of an unconfirmed
-    seam, because it is not known which points are false. Parts of fewer than ten
+    determine their relative scale. No points join the stretches on either side of a seam
+    that false links bend, because it is not known which points are false. Parts of fewer than ten
     images are dropped, except the largest.
 
     Args:
         model: the model with its points.
         image_set: all images.
         seams: names of the images before and after each seam.
-        unconfirmed: those of the seams at which links may be false, see `unconfirmed_seams`.
+        false: those of the seams that false links bend, see `false_links`.
         rival: other poses of its images, and maybe of others, with points, that fit the
             observations about as well.
     """
@@ -229,7 +234,7 @@ def parts_of(
         same = _with_images(rival, model.by_name.keys())
         scaled = np.minimum(scaled, _common_points(same, stretch_of, len(sequence_of))[1])
     is_same = np.equal.outer(sequence_of, sequence_of)
-    for first, _ in unconfirmed:
+    for first, _ in false:
         before = stretch_of[first] + 1
         scaled[:before, before:] = scaled[before:, :before] = 0
     is_connected = np.where(is_same, scaled >= _WITHIN_VIDEO, common >= _BETWEEN_VIDEOS)

@@ -80,7 +80,7 @@ def test_frames_are_found_from_image_names(
         (["0.png", "12.png"], 10, "frames"),
         (["left.png", "right.png", "top.png"], 10, "left"),
         ([f"{i}.png" for i in range(11)], 10, "11"),
-        (["a/0.png", "b/0.png", "b/5.png"], 10, "two"),
+        (["a/0.png", "b/0.png", "b/5.png"], 10, "same"),
     ],
 )
 def test_image_names_without_clear_frames_are_refused(

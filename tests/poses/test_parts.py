@@ -17,9 +17,9 @@ from colmap_av1.geometry.colmap_model import ModelImage, read_model
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.image_set import ImageSet
+from colmap_av1.poses.false_links import contradicted_seams, jumping_seams
 from colmap_av1.poses.parts import certain_parts, parts_of
 from colmap_av1.poses.track_matches import tracks_of_model
-from colmap_av1.poses.unconfirmed_seams import unconfirmed_seams
 from colmap_av1.reconstruct import reconstruct
 from colmap_av1.tracks.tracks import Tracks
 
@@ -128,12 +128,12 @@ def test_points_do_not_join_parts_across_a_seam_that_tracks_contradict() -> None
     own = [*stretch(0, 11), *stretch(12, 23), *stretch(24, 35)]
     known = model(image_set, [*own, *[[0, 5, 30, 35]] * 200, *[[12, 20, 30, 35]] * 200])
     assert len(parts_of(known, image_set, seams)) == 1
-    parts = parts_of(known, image_set, seams, unconfirmed=seams[:1])
+    parts = parts_of(known, image_set, seams, false=seams[:1])
     assert parts == [names(image_set, *range(12, 36)), names(image_set, *range(12))]
 
 
 @pytest.mark.parametrize("share", [0.2, 0.9])
-def test_a_seam_is_unconfirmed_if_most_tracks_do_not_fit(share: float) -> None:
+def test_a_seam_is_contradicted_if_most_tracks_do_not_fit(share: float) -> None:
     image_set = images(12)
     known = seen_at(model(image_set, [[5, 6]] * 100), [10.0] * 100)
     xy = known.points.xy.copy()
@@ -142,14 +142,13 @@ def test_a_seam_is_unconfirmed_if_most_tracks_do_not_fit(share: float) -> None:
     tracks = tracks_of_model(replace(known, points=points), image_set)
     seams = [seam(image_set, 5)]
     contradicted = seams if share < 0.4 else []
-    for few_points in ([], seams):
-        assert unconfirmed_seams(known, image_set, tracks, seams, few_points) == contradicted
+    assert contradicted_seams(known, image_set, tracks, seams) == contradicted
+    few = tracks.keep_tracks(np.arange(tracks.num_tracks) < 20)
+    assert contradicted_seams(known, image_set, few, seams) == []
 
 
-@pytest.mark.parametrize(("jump", "is_unconfirmed"), [(1, False), (8, False), (30, True)])
-def test_a_seam_without_tracks_is_unconfirmed_if_the_camera_is_too_fast(
-    jump: int, is_unconfirmed: bool
-) -> None:
+@pytest.mark.parametrize(("jump", "is_false"), [(1, False), (8, False), (30, True)])
+def test_a_camera_that_is_too_fast_at_a_seam_shows_false_links(jump: int, is_false: bool) -> None:
     """Five images are lost at the seam."""
     every = images(24)
     image_set = every.some([*range(10), *range(15, 24)])
@@ -158,9 +157,7 @@ def test_a_seam_without_tracks_is_unconfirmed_if_the_camera_is_too_fast(
         image.cam_from_world[0, 3] = -number - (jump if number >= 10 else 0)
     seams = [(image_set.images.names[9], image_set.images.names[10])]
     nothing = Tracks.empty(24, (640, 480))
-    assert unconfirmed_seams(known, every, nothing, seams, []) == []
-    expected = seams if is_unconfirmed else []
-    assert unconfirmed_seams(known, every, nothing, seams, seams) == expected
+    assert jumping_seams(known, every, nothing, seams) == (seams if is_false else [])
 
 
 def test_another_video_joins_parts() -> None:

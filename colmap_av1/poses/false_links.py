@@ -9,7 +9,7 @@ than it can have moved in the images that are lost at the seam.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -28,50 +28,74 @@ _LEAST_FITTING = 0.4
 # Fewer tracks show nothing.
 _FEWEST = 30
 # A camera moves too fast across a seam if its speed exceeds this multiple of the speed that it
-# hardly ever exceeds elsewhere in the video. On 37 rendered walks, it was 2.2 where false links
-# bent the model, and at most 0.9 at other seams without tracks and with few points.
+# hardly ever exceeds elsewhere in the video. On 21 rendered walks, it was 2.2 where false links
+# bent the model, and at most 0.54 at other seams without tracks and with few points.
 _TOO_FAST = 1.5
 _HARDLY_EVER = 0.9  # a quantile
 
 
-def unconfirmed_seams(
-    model: PosedModel,
-    image_set: ImageSet,
-    tracks: Tracks,
-    seams: Sequence[tuple[str, str]],
-    few_points: Collection[tuple[str, str]],
+def contradicted_seams(
+    model: PosedModel, image_set: ImageSet, tracks: Tracks, seams: Sequence[tuple[str, str]]
 ) -> list[tuple[str, str]]:
-    """The seams across which the tracks contradict the poses, or the camera moves too fast.
-
-    Speed counts only where hardly any points and tracks show how the camera moves.
+    """The seams across which most tracks contradict the poses.
 
     Args:
         model: the poses.
         image_set: all images.
         tracks: the tracks of all videos.
         seams: names of the images before and after each seam.
-        few_points: those that hardly any points join, see `Seams.few_points`.
     """
+    shares = _shares_fitting(model, image_set, tracks, seams)
+    return [
+        seam
+        for seam, share in zip(seams, shares, strict=True)
+        if share is not None and share < _LEAST_FITTING
+    ]
+
+
+def jumping_seams(
+    model: PosedModel, image_set: ImageSet, tracks: Tracks, seams: Sequence[tuple[str, str]]
+) -> list[tuple[str, str]]:
+    """The seams without tracks across which the camera moves too fast.
+
+    Args:
+        model: the poses.
+        image_set: all images.
+        tracks: the tracks of all videos.
+        seams: names of the images before and after each seam.
+    """
+    shares = _shares_fitting(model, image_set, tracks, seams)
     speeds = _relative_speeds(model, image_set)
+    return [
+        seam
+        for seam, share in zip(seams, shares, strict=True)
+        if share is None and speeds[seam] > _TOO_FAST
+    ]
+
+
+def _shares_fitting(
+    model: PosedModel, image_set: ImageSet, tracks: Tracks, seams: Sequence[tuple[str, str]]
+) -> list[float | None]:
+    """The share of the tracks across each seam that fit the poses; None for few tracks."""
     order, bounds = tracks.by_frame()
     track, frame_of, poses = tracks.track, image_set.images.frame_of, model.by_name
 
-    def is_unconfirmed(names: tuple[str, str]) -> bool:
+    def share(names: tuple[str, str]) -> float | None:
         views = [poses[name] for name in names]
         cameras = [model.cameras[view.camera_id] for view in views]
         seen = [order[bounds[f] : bounds[f + 1]] for f in (frame_of[name] for name in names)]
         first, second = (track[own] for own in seen)
         _, *both = np.intersect1d(first, second, return_indices=True)
         if len(both[0]) < _FEWEST:
-            return names in few_points and speeds[names] > _TOO_FAST
+            return None
         rays = [
             np.asarray(camera.cam_from_img(tracks.xy[own[rows]].astype(np.float64))).T
             for camera, own, rows in zip(cameras, seen, both, strict=True)
         ]
         error = error_by_poses([view.cam_from_world for view in views], cameras, rays)
-        return bool(np.mean(error <= _MAX_ERROR) < _LEAST_FITTING)
+        return float(np.mean(error <= _MAX_ERROR))
 
-    return [seam for seam in seams if is_unconfirmed(seam)]
+    return [share(seam) for seam in seams]
 
 
 def _relative_speeds(model: PosedModel, image_set: ImageSet) -> dict[tuple[str, str], float]:
