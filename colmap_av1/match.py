@@ -87,7 +87,8 @@ class MatchReport:
         num_images: images of the database.
         num_written_images: image files written; the others existed or were not requested.
         masked: share of the images' pixels that masks exclude; None without masks.
-        num_tracks: tracks of the videos used for matching.
+        num_tracks: tracks whose observations are keypoints: of motion, and with a joint estimate
+            also of corners and SIFT links.
         track_lengths: quantiles of the number of images that observe a track, from 0 (shortest)
             to 1 (longest); empty without tracks.
         num_observations: keypoints of all images.
@@ -520,7 +521,10 @@ def _match_images(
         return _match_pairs(images, cameras, options, context)
     try:
         if cameras is not None and _has_several_cameras(images.image_set, cameras):
-            raise ModelError("the database has several cameras for the images of one video")
+            raise ModelError(
+                "the database has several cameras for the images of one video: leave out --verify "
+                "joint"
+            )
         return _match_jointly(images, cameras, scratch, options, context)
     except (ModelError, VideoError) as error:
         if options.verify.verify == "joint":

@@ -94,7 +94,7 @@ class ReconstructReport:
         other_models: further models of images that are not connected to the first model, in the
             folders `model_1`, ... of the output.
         num_tracks: number of tracks of the videos.
-        num_pose_tracks: number of tracks that the poses were estimated from.
+        num_pose_tracks: number of motion tracks by which the mapped images were matched.
         num_points: number of 3D points.
         num_observations: number of observations of all points.
         coverage: share of the images' cells of 16x16 pixels that contain projected points.

@@ -32,8 +32,8 @@ class ImageSet:
     numbered through all sequences, in the order of the sequences.
 
     Attributes:
-        videos: names of the videos for messages; '' for a single video. The videos are the first
-            sequences.
+        videos: the folder of each video's images, which is its name in messages; '' for a single
+            video. The videos are the first sequences.
         images: names of the images, and their frames, numbered through all sequences.
         sequence: int32 [num_images] the sequence of each image, ascending.
         first_frame: int64 [num_sequences + 1] first frame of each sequence, and `num_frames`.

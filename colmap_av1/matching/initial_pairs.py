@@ -99,9 +99,10 @@ def prepare_start(
 
     If the limits are not the default ones, the mapper without options tries hundreds of pairs with
     few inliers. RANSAC may give any of them a wrong pose with a large angle. These pairs are
-    demoted, too, except neighbours, which connect the images. If all images are in one model, they
-    keep fewer inliers than the mapper ever accepts. Otherwise the images of fast turns might not
-    register, and with forward motion the mapper might find no pair at all.
+    demoted, too, except neighbours, which connect the images. With `SMALL_ANGLES` and one known
+    model, all demoted pairs keep fewer inliers than the mapper ever accepts. With several models,
+    images of fast turns might then not register; with forward motion, the mapper might find no
+    pair.
 
     If poses are known of several models, the mapper begins several times. Pairs with a wrong pose
     and at least 50 inliers keep fewer inliers than it ever accepts, too, and bad pairs of each

@@ -60,7 +60,7 @@ class _FirstEstimate:
 
     Attributes:
         links: where links are looked for.
-        may_be_right: whether pictures agree with the poses, or may agree after a split.
+        may_be_right: whether no pictures contradict the poses, or a split may mend them.
     """
 
     links: _FurtherLinks

@@ -52,6 +52,21 @@ class FurtherPoses:
     image_set: ImageSet
 
 
+@dataclass(frozen=True)
+class TriedModel:
+    """A further model that was estimated.
+
+    Attributes:
+        poses: its poses; None if it is not used because too few tracks agree with its poses, its
+            positions are uncertain, or it has too few images.
+        lost: names of images that the mapper registered in it, and that it has lost; other models
+            may have them.
+    """
+
+    poses: FurtherPoses | None
+    lost: frozenset[str]
+
+
 def further_poses(
     run: Run,
     first: Posed,
@@ -59,9 +74,8 @@ def further_poses(
     read_tracks: Callable[[], Sequence[Tracks]],
     *,
     map_again: bool,
-    left_out: set[str] | None = None,
-) -> Iterator[FurtherPoses]:
-    """Yield the poses of the models that are not connected to the first.
+) -> Iterator[TriedModel]:
+    """Estimate the poses of the models that are not connected to the first, one after the other.
 
     The mapper may register an image in several models. It belongs to the first of these only,
     because trainers that search the whole output folder would confuse images and masks of different
@@ -74,8 +88,6 @@ def further_poses(
         read_tracks: reads the tracks of each video. They are large, so they are not kept between
             the models.
         map_again: map the models again from their observations, see `remapping`.
-        left_out: gets the names of the images of models that are not used: too few tracks agree
-            with their poses, their positions are uncertain, or they have too few images.
     """
     first_model = read_poses(run, first.last)
     left = set(image_set.images.names) - first_model.by_name.keys()
@@ -116,12 +128,12 @@ def further_poses(
             # If a model is not used, its parts must not grow into it again.
             excluded = frozenset() if used else mapped.excluded | registered | known
             waiting += _other_models(own, posed, excluded)
-        if left_out is not None:
-            left_out |= (known & left) - used
+        lost = frozenset((known & left) - used)
         if posed is None or not used:
+            yield TriedModel(None, lost)
             continue
         number += 1
-        yield FurtherPoses(own, posed, _named(image_set, left))
+        yield TriedModel(FurtherPoses(own, posed, _named(image_set, left)), lost)
         left -= used
     _remove_further_models(run, number)
 

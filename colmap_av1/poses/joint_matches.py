@@ -143,24 +143,21 @@ def match_jointly(
     far = posed.long_range.result if posed.long_range is not None else None
     models = [_model_of(run, posed, image_set)]
     # A second mapping would join images across turns, which the mapper of the database then bends.
-    left_out = set[str]()
-    further = further_poses(
-        run,
-        posed,
-        image_set,
-        lambda: [v.tracks for v in videos],
-        map_again=False,
-        left_out=left_out,
-    )
-    for own in further:
-        models.append(_model_of(own.run, own.posed, own.image_set))
+    lost = set[str]()
+    for tried in further_poses(
+        run, posed, image_set, lambda: [v.tracks for v in videos], map_again=False
+    ):
+        lost |= tried.lost
+        if tried.poses is not None:
+            own = tried.poses
+            models.append(_model_of(own.run, own.posed, own.image_set))
     first = models[0]
     models.sort(key=lambda model: -len(model.placed.images))
     registered = {image.name for model in models for image in model.placed.images}
     left = [name for name in image_set.images.names if name not in registered]
     num_images = len(image_set.sequence)
-    # Images of uncertain models do not count: without the estimate, their models would be bent.
-    if len(left_out.union(registered)) <= (1 - _MAX_LEFT) * num_images:
+    # Images of uncertain models count, because without the estimate their models would be bent.
+    if len(lost.union(registered)) <= (1 - _MAX_LEFT) * num_images:
         raise ModelError(
             f"the joint estimate registers only {num_images - len(left)} of {num_images} images: "
             "match them pair by pair with --verify pairs"

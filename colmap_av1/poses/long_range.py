@@ -301,7 +301,7 @@ def _far_pairs(
 
 
 def _viewing_angle(points: Floats, first: PosedCamera, second: PosedCamera) -> float | None:
-    """Median angle in degrees between the directions in which two images see the same points.
+    """Median angle in degrees between the directions of points of an image from two images.
 
     Returns None if the second image does not see most of the points of the first, or if the angle
     or the ratio of the distances is too large.

@@ -98,7 +98,7 @@ def mapping_stage(
                     break
         if not found:
             camera = options.match.camera
-            raise ModelError(_why_no_initial_pair(found_before, attempt.mapper, camera))
+            raise ModelError(_why_no_model(found_before, attempt.mapper, camera))
         found = [with_second_distortion(run, model) for model in found]
         # Further images belong to the model of their nearest key image.
         found.sort(key=lambda model: -num_nearest(model, image_set, keyed))
@@ -194,10 +194,11 @@ def with_model_first(run: Run, mapped: Kept[MappedResult], file: str) -> Kept[Ma
     return replace(mapped, result=result, digest=digest_of([mapped.digest, file]))
 
 
-def _why_no_initial_pair(found: MatchesResult, mapper: str, camera: CameraOptions) -> str:
-    """Why a mapper found no initial pair with these camera options, and the remedy."""
-    failure = f"COLMAP's {mapper} mapper finds no initial pair"
-    other = "incremental" if mapper == "global" else "global"
+def _why_no_model(found: MatchesResult, mapper: str, camera: CameraOptions) -> str:
+    """Why a mapper found no model with these camera options, and the remedy."""
+    is_global = mapper == "global"
+    failure = f"COLMAP's {mapper} mapper finds no {'model' if is_global else 'initial pair'}"
+    other = "incremental" if is_global else "global"
     options = ("camera_model", "camera_params")
     missing = [f"--{name}" for name in options if getattr(camera, name) is None]
     give = f"give {' and '.join(missing) or 'other --camera_params'}, or try --mapper {other}"

@@ -41,7 +41,7 @@ class MatchesResult:
         links: SIFT links across gaps and loop closures.
         warnings: warnings about cameras and links.
         key_images: indices of the key images.
-        num_pose_tracks: number of tracks that the poses are estimated from.
+        num_pose_tracks: number of motion tracks by which the key images are matched.
         assumes_focal_length: whether the focal length of some video is assumed.
         forward_motion: whether the camera moves along its optical axis, see `MatchReport`.
         depth: whether the matches determine depth.

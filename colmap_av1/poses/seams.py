@@ -112,16 +112,20 @@ class Seams:
     @property
     def worst_scale_lost(self) -> list[int]:
         """Indices of the worst seam in every run of consecutive seams that lose the scale."""
+        return [
+            min(run, key=lambda i: (int(self.num_scaled[i]), abs(2 * i - run[0] - run[-1])))
+            for run in self._lost_runs()
+        ]
+
+    def _lost_runs(self) -> list[list[int]]:
+        """The runs of consecutive seams that lose the scale, each a list of indices."""
         runs: list[list[int]] = []
         for seam in self.scale_lost:
             if runs and self._are_consecutive(runs[-1][-1], seam):
                 runs[-1].append(seam)
             else:
                 runs.append([seam])
-        return [
-            min(run, key=lambda i: (int(self.num_scaled[i]), abs(2 * i - run[0] - run[-1])))
-            for run in runs
-        ]
+        return runs
 
     def _are_consecutive(self, seam: int, other: int) -> bool:
         """Whether the image after a seam is the one before the other seam."""
@@ -157,16 +161,14 @@ class Seams:
     @property
     def _scale_warning(self) -> str | None:
         """Warning about seams that lose the scale."""
-        if not self.scale_lost:
+        runs = self._lost_runs()
+        if not runs:
             return None
-        first = last = self.scale_lost[0]
-        while last + 1 in self.scale_lost and self._are_consecutive(last, last + 1):
-            last += 1
-        more = self.scale_lost[-1] > last
+        first, last = runs[0][0], runs[0][-1]
+        others = ", and elsewhere" if len(runs) > 1 else ""
         return (
             f"hardly any points carry the scale from '{self.pairs[first][0]}' to "
-            f"'{self.pairs[last][1]}'"
-            f"{', and elsewhere' if more else ''}: the camera turns there without moving sideways, "
+            f"'{self.pairs[last][1]}'{others}: the camera turns there without moving sideways, "
             "so the parts before and after may differ in scale; keep walking while you turn, or "
             "reconstruct the two parts separately"
         )

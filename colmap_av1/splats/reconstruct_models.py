@@ -78,7 +78,10 @@ def further_models(
     def tracks() -> list[Tracks]:
         return [read_tracks_only(run, video) for video in range(len(run.sources))]
 
-    for own in further_poses(run, first, image_set, tracks, map_again=True):
+    for tried in further_poses(run, first, image_set, tracks, map_again=True):
+        own = tried.poses
+        if own is None:
+            continue
         index = np.searchsorted(image_set.images.frames, own.image_set.images.frames)
         assert run.positions is not None
         # The known distance is between points of the first model.

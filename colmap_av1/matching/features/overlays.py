@@ -21,8 +21,8 @@ _LEAST_SHARE = 0.3
 # If the median share of all features is above this, the camera stands still and none is removed.
 _USUAL_SHARE = 0.25
 # The camera stands still between two images if more than this share of the features of one is fixed
-# in the other. These images are not compared. With noise, half of the features of a scene or more
-# are fixed; of an overlay, there are fewer.
+# in the other. These images are not compared. If it stands still, half of the features or more are
+# fixed even with noise; an overlay has fewer.
 _SCENE_SHARE = 0.4
 # Side in pixels of the cells that overlays cover. Features at the edges of an overlay change with
 # the scene behind it, so whole cells are removed.

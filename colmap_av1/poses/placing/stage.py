@@ -75,7 +75,7 @@ def place_stage(
         write_posed_model(partial / file, PosedModel(placed.cameras, images))
         return PlaceResult(
             poses=Path(file).name,
-            num_registered=posed.result.num_registered,
+            num_registered=len(images),
             place=found.place,
             place_warnings=tuple(found.warnings),
         )
