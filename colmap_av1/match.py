@@ -53,8 +53,8 @@ from colmap_av1.options import (
 from colmap_av1.options.fields import Options
 from colmap_av1.options.words import words_of
 from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
+from colmap_av1.poses.mapper_trials import demote_failing_starts
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.start_trials import demote_failing_starts
 from colmap_av1.poses.track_stage import VideoTracks, encoding_for_pictures
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.video_tracks import decodable_frames

@@ -321,7 +321,7 @@ def test_database_is_written_although_the_mapper_crashes(
     def crash(*args: object, **options: object) -> None:
         raise ModelError("the mapper stopped")
 
-    monkeypatch.setattr("colmap_av1.poses.start_trials.start_mapper", crash)
+    monkeypatch.setattr("colmap_av1.poses.mapper_trials.start_mapper", crash)
     report = match(tmp_path / "a.db", clip)
     assert any("trial" in warning for warning in report.warnings)
     assert len(read_images(tmp_path / "a.db")) == report.num_images
@@ -333,7 +333,7 @@ def test_mapper_is_not_tried_if_the_camera_only_turns(
     def fail(*args: object, **options: object) -> None:
         pytest.fail("the mapper was tried")
 
-    monkeypatch.setattr("colmap_av1.poses.start_trials.start_mapper", fail)
+    monkeypatch.setattr("colmap_av1.poses.mapper_trials.start_mapper", fail)
     wall = np.random.default_rng(5).integers(0, 256, (60, 120, 3), dtype=np.uint8)
     wall = cv2.resize(wall, (480, 240))
     frames = np.stack([wall[:, 5 * i : 5 * i + 320] for i in range(16)])

@@ -222,7 +222,7 @@ def _used_links(estimates: _Estimates, further: _FurtherLinks) -> _FurtherLinks:
     may_mislead = (
         estimates.run.options.match.links.links == "auto"
         and estimates.image_set.num_sequences == 1
-        and estimates.split(further, None).links.num_tracks > 0
+        and estimates.split(further, None).link_tracks.num_tracks > 0
     )
     if not (may_mislead and linked.is_contradicted):
         return further

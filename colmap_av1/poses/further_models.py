@@ -90,20 +90,20 @@ def further_poses(
         map_again: map the models again from their observations, see `remapping`.
     """
     first_model = read_poses(run, first.last)
-    left = set(image_set.images.names) - first_model.by_name.keys()
+    free = set(image_set.images.names) - first_model.by_name.keys()
     waiting = [_with_cameras_of(first_model, other) for other in _other_models(run, first)]
     number = 1
     while waiting:
         mapped = waiting.pop(0)
         known = set(mapped.model.by_name)
-        if len(known & left) < LEAST_IMAGES:  # nearly all of its images are in an earlier model
+        if len(known & free) < LEAST_IMAGES:  # nearly all of its images are in an earlier model
             continue
         own = _run_of_model(run, number)
         own_poses = _poses_of_model(own, first, mapped)
         if keeps_intrinsics(mapped.model, first_model):
             own = _with_known_intrinsics(own)
-        free = left.difference(mapped.excluded, *(other.model.by_name for other in waiting))
-        some = _named(image_set, known | free)
+        candidates = free.difference(mapped.excluded, *(other.model.by_name for other in waiting))
+        some = _named(image_set, known | candidates)
         try:
             posed = refined_poses(
                 own,
@@ -123,18 +123,18 @@ def further_poses(
         if posed is not None:
             registered = _registered(own, posed)
             is_certain = posed.mapped.result.num_registered > 0
-            if is_certain and len(registered & left) >= MIN_MODEL_SIZE:
-                used = registered & left
+            if is_certain and len(registered & free) >= MIN_MODEL_SIZE:
+                used = registered & free
             # If a model is not used, its parts must not grow into it again.
             excluded = frozenset() if used else mapped.excluded | registered | known
             waiting += _other_models(own, posed, excluded)
-        lost = frozenset((known & left) - used)
+        lost = frozenset((known & free) - used)
         if posed is None or not used:
             yield TriedModel(None, lost)
             continue
         number += 1
-        yield TriedModel(FurtherPoses(own, posed, _named(image_set, left)), lost)
-        left -= used
+        yield TriedModel(FurtherPoses(own, posed, _named(image_set, free)), lost)
+        free -= used
     _remove_further_models(run, number)
 
 

@@ -27,6 +27,7 @@ from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.estimate import estimate_poses
 from colmap_av1.poses.further_models import further_poses
+from colmap_av1.poses.initial_pair import InitialPair, initial_pair
 from colmap_av1.poses.joint_cameras import joint_cameras
 from colmap_av1.poses.long_range_stage import LongRangeResult
 from colmap_av1.poses.matched_observations import (
@@ -43,7 +44,6 @@ from colmap_av1.poses.posed_images import (
     triangulate_in,
 )
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.starting_pair import StartingPair, starting_pair
 from colmap_av1.poses.track_matches import at_same_place, pair_by_tracks, tracks_of_model
 from colmap_av1.poses.track_stage import VideoTracks, pose_tracks
 from colmap_av1.poses.unregistered import models_of_images, tracks_of_unregistered, within_models
@@ -154,25 +154,25 @@ def match_jointly(
     first = models[0]
     models.sort(key=lambda model: -len(model.placed.images))
     registered = {image.name for model in models for image in model.placed.images}
-    left = [name for name in image_set.images.names if name not in registered]
+    not_registered = [name for name in image_set.images.names if name not in registered]
     num_images = len(image_set.sequence)
     # Images of uncertain models count, because without the estimate their models would be bent.
     if len(lost.union(registered)) <= (1 - _MAX_LEFT) * num_images:
         raise ModelError(
-            f"the joint estimate registers only {num_images - len(left)} of {num_images} images: "
-            "match them pair by pair with --verify pairs"
+            f"the joint estimate registers only {len(registered)} of {num_images} images: match "
+            "them pair by pair with --verify pairs"
         )
     with run.clock.measure("pairs"):
-        others = tracks_of_unregistered(run, posed, image_set, left, density)
+        others = tracks_of_unregistered(run, posed, image_set, not_registered, density)
         model_of = models_of_images(others, [model.placed.frames for model in models], image_set)
-        others = within_models(others, left, model_of, image_set)
+        others = within_models(others, not_registered, model_of, image_set)
         agreeing = [_agreeing_tracks(model, image_set, others, density) for model in models]
         paired = _paired(run, image_set, agreeing, others, density)
     cameras = joint_cameras(
         run, image_set, [(m.known, {i.name for i in m.placed.images}) for m in models]
     )
     matched = verify_images(paired, cameras, run.options.match.verify, run.context)
-    warnings = _warnings(far, models, left, others, image_set)
+    warnings = _warnings(far, models, not_registered, others, image_set)
     if first.adjusted.seams_warning is not None:
         warnings.append(first.adjusted.seams_warning)
     matches = posed.matches.result
@@ -187,7 +187,7 @@ def match_jointly(
         focal_length=_focal_length(run, cameras[0]),
         matched=matched,
         links=matches.links,
-        link_tracks=posed.links,
+        link_tracks=posed.link_tracks,
         track_lengths=paired.track_lengths,
         depth=matches.depth,
         warnings=(*matches.warnings, *warnings),
@@ -249,7 +249,7 @@ class _Agreeing:
     placed: PosedImages
     tracks: Tracks
     num_corners: int
-    start: StartingPair | None
+    start: InitialPair | None
 
 
 def _agreeing_tracks(
@@ -309,10 +309,10 @@ def _agreeing_motion(run: Run, tracks: Tracks, placed: PosedImages) -> tuple[Tra
     return seen.take(points.observation, points.offsets), points.xyz
 
 
-def _start(tracks: Tracks, points: Floats, placed: PosedImages) -> StartingPair | None:
-    """The initial pair for a mapper, see `starting_pair`."""
+def _start(tracks: Tracks, points: Floats, placed: PosedImages) -> InitialPair | None:
+    """The initial pair for a mapper, see `initial_pair`."""
     view = np.searchsorted(placed.frames, tracks.frame)
-    start = starting_pair(tracks.track, view, points, placed.images)
+    start = initial_pair(tracks.track, view, points, placed.images)
     if start is None:
         return None
     chosen = evenly_spread(len(start.points), _MAX_INITIAL_MATCHES)
@@ -347,7 +347,7 @@ def _paired(
     """Match registered images along the tracks that agree with the poses, others along all."""
     frames = image_set.images.frames
     limits = limits_of_density(density, partial(_num_features, run, image_set))
-    tracks, starts = list[Tracks](), list[StartingPair]()
+    tracks, starts = list[Tracks](), list[InitialPair]()
     num_tracks = 0
     for own in agreeing:
         kept = _matched(own, frames, limits)
@@ -358,7 +358,7 @@ def _paired(
             views = own.placed.frames[[own.start.first, own.start.second]]
             first, second = np.searchsorted(frames, views).tolist()
             points = np.cumsum(is_kept)[own.start.points] - 1 + num_tracks
-            starts.append(StartingPair(first, second, points))
+            starts.append(InitialPair(first, second, points))
         num_tracks += tracks[-1].num_tracks
 
     def choose(keypoints: list[ImageKeypoints]) -> NDArray[np.int32]:
@@ -386,7 +386,7 @@ def _focal_length(run: Run, camera: pycolmap.Camera) -> float | None:
 def _warnings(
     far: LongRangeResult | None,
     models: Sequence[_Model],
-    left: Sequence[str],
+    not_registered: Sequence[str],
     others: Tracks,
     image_set: ImageSet,
 ) -> list[str]:
@@ -395,7 +395,7 @@ def _warnings(
     Args:
         far: result of the long-range check of the first model; None without one.
         models: the models.
-        left: names of the images that are not registered.
+        not_registered: names of the images that are not registered.
         others: the tracks by which images are matched that are not registered.
         image_set: all images.
     """
@@ -413,9 +413,9 @@ def _warnings(
         )
     num_images = len(image_set.sequence)
     frame_of = image_set.images.frame_of
-    is_matched = np.isin([frame_of[name] for name in left], others.frame)
-    matched = [name for name, own in zip(left, is_matched, strict=True) if own]
-    alone = [name for name, own in zip(left, is_matched, strict=True) if not own]
+    is_matched = np.isin([frame_of[name] for name in not_registered], others.frame)
+    matched = [name for name, own in zip(not_registered, is_matched, strict=True) if own]
+    alone = [name for name, own in zip(not_registered, is_matched, strict=True) if not own]
     if matched:
         warnings.append(
             f"{len(matched)} of {num_images} images are not registered in the joint estimate and "

@@ -22,11 +22,11 @@ from colmap_av1.geometry.posed_model import (
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import CameraOptions, MapOptions
 from colmap_av1.poses.adjusting import refines_intrinsics, with_second_distortion
+from colmap_av1.poses.longest_tracks import keep_longest_tracks
 from colmap_av1.poses.mapper import MapperEffort, map_poses
 from colmap_av1.poses.match_stage import MatchesResult
 from colmap_av1.poses.posed_images import PosesResult
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.start_tracks import keep_start_tracks
 from colmap_av1.poses.track_stage import LEAST_IMAGES
 from colmap_av1.util.digests import digest_of
 from colmap_av1.util.stages import Kept, run_stage
@@ -87,7 +87,7 @@ def mapping_stage(
                 database = partial / f"{attempt.mapper}.db"
                 shutil.copyfile(run.output / "database.db", database)
                 if attempt.mapper == "global" and mapping.adjust:
-                    keep_start_tracks(database)
+                    keep_longest_tracks(database)
                 try:
                     found = mapped_models(run, database, attempt, effort, keyed.images.names)
                 except ModelError:

@@ -57,7 +57,7 @@ class Posed:
         adjustment: the adjusted poses; None if they are not adjusted.
         tracks: the tracks of all videos, cut at gaps that links replace and at seams of splits,
             without dynamic pixels.
-        links: links as tracks, without dynamic pixels.
+        link_tracks: links as tracks, without dynamic pixels.
         dynamic_masks: masks that exclude dynamic objects, by image name.
         has_picture_positions: whether tracks have positions in the pictures; false if they were
             corrected for a rolling shutter.
@@ -72,7 +72,7 @@ class Posed:
     dynamic: Kept[DynamicResult] | None
     adjustment: Kept[AdjustedResult] | None
     tracks: Tracks
-    links: Tracks
+    link_tracks: Tracks
     dynamic_masks: dict[str, Mask]
     has_picture_positions: bool
     long_range: Kept[LongRangeResult] | None = None
@@ -253,7 +253,7 @@ def _adjusted(
     return adjustment_stage(
         run,
         posed.tracks,
-        posed.links,
+        posed.link_tracks,
         image_set,
         poses,
         dynamic_masks=posed.dynamic_masks,
@@ -303,7 +303,7 @@ def refined_poses(
         dynamic=dynamic,
         adjustment=None,
         tracks=tracks,
-        links=links,
+        link_tracks=links,
         dynamic_masks=dynamic_masks,
         has_picture_positions=has_picture_positions,
     )

@@ -38,6 +38,7 @@ from colmap_av1.matching.pairs import covisible_pairs
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.adjusting import adjust_posed, mean_cost, refines_intrinsics
 from colmap_av1.poses.adjustment_stage import AdjustedResult
+from colmap_av1.poses.longest_tracks import keep_longest_tracks
 from colmap_av1.poses.mapping_stage import MappedResult, mapped_models
 from colmap_av1.poses.posed_images import (
     FROM_PICTURES,
@@ -46,7 +47,6 @@ from colmap_av1.poses.posed_images import (
     triangulate_in,
 )
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.start_tracks import keep_start_tracks
 from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
@@ -186,7 +186,7 @@ def _map_tracks(
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "database.db"
         write_matches(database, names, cameras, matched)
-        keep_start_tracks(database)
+        keep_longest_tracks(database)
         try:
             found = mapped_models(run, database, map_options, "early", names)
         except ModelError:  # the first mapping is there

@@ -21,7 +21,11 @@ _LONGEST_GAP = 3
 
 
 def tracks_of_unregistered(
-    run: Run, posed: Posed, image_set: ImageSet, left: Sequence[str], density: DensityOptions
+    run: Run,
+    posed: Posed,
+    image_set: ImageSet,
+    not_registered: Sequence[str],
+    density: DensityOptions,
 ) -> Tracks:
     """Motion tracks and SIFT links with observations in images that are not registered.
 
@@ -29,38 +33,39 @@ def tracks_of_unregistered(
         run: the run.
         posed: the first model.
         image_set: all images.
-        left: names of the images that are not registered.
+        not_registered: names of the images that are not registered.
         density: which motion tracks are selected.
     """
-    if not left:
+    if not not_registered:
         return Tracks.empty(posed.tracks.num_frames, (posed.tracks.width, posed.tracks.height))
     frames, frame_of = image_set.images.frames, image_set.images.frame_of
     motion = select_tracks(pose_tracks(run, posed.tracks).keep_frames(frames), density)
-    seen = Tracks.concatenate(motion, posed.links.keep_frames(frames))
-    is_left = np.isin(seen.frame, [frame_of[name] for name in left])
-    return seen.keep_tracks(seen.having(is_left))
+    seen = Tracks.concatenate(motion, posed.link_tracks.keep_frames(frames))
+    is_wanted = np.isin(seen.frame, [frame_of[name] for name in not_registered])
+    return seen.keep_tracks(seen.having(is_wanted))
 
 
 def within_models(
-    tracks: Tracks, left: Sequence[str], model_of: Ints, image_set: ImageSet
+    tracks: Tracks, not_registered: Sequence[str], model_of: Ints, image_set: ImageSet
 ) -> Tracks:
     """Split tracks so that none connects two models or leads to images that belong to none.
 
     Args:
         tracks: tracks with observations in images that are not registered.
-        left: names of the images that are not registered.
+        not_registered: names of the images that are not registered.
         model_of: see `models_of_images`.
         image_set: all images.
 
     Returns:
-        The parts of the tracks in the images of each model that observe an image of `left`.
+        The parts of the tracks in the images of each model that observe an image that is not
+        registered.
     """
     image = np.searchsorted(image_set.images.frames, tracks.frame)
-    is_left = np.isin(image_set.images.names, left)[image]
+    is_wanted = np.isin(image_set.images.names, not_registered)[image]
     parts = [Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))]
     for number in range(int(model_of.max()) + 1):
         in_model = model_of[image] == number
-        touching = np.isin(tracks.track, tracks.track[in_model & is_left])
+        touching = np.isin(tracks.track, tracks.track[in_model & is_wanted])
         parts.append(tracks.keep_observations(in_model & touching))
     return Tracks.concatenate(*parts)
 

@@ -59,7 +59,7 @@ def written_model(
     """Place the model in the world, and write it with the points of all tracks."""
     assert run.positions is not None
     placed = place_stage(run, image_set, posed.last, run.positions)
-    tracks = Tracks.concatenate(posed.tracks, posed.links)
+    tracks = Tracks.concatenate(posed.tracks, posed.link_tracks)
     return placed, model_stage(run, tracks, image_set, posed.dynamic_masks, placed)
 
 

@@ -35,8 +35,8 @@ from colmap_av1.options import (
     VerifyOptions,
 )
 from colmap_av1.poses import estimate, long_range
+from colmap_av1.poses.initial_pair import initial_pair
 from colmap_av1.poses.posed import Posed
-from colmap_av1.poses.starting_pair import starting_pair
 from colmap_av1.video.decoding import decode_frames
 
 # The pictures of the rendered clip are scaled by this factor.
@@ -322,7 +322,7 @@ def images_ahead(count: int) -> list[ModelImage]:
     return [ModelImage(i + 1, f"{i}.png", 1, pose) for i, pose in enumerate(poses)]
 
 
-def test_starting_pair_of_a_drive_uses_points_beside_the_road() -> None:
+def test_initial_pair_of_a_drive_uses_points_beside_the_road() -> None:
     """Distant points ahead have too little parallax."""
     rng = np.random.default_rng(0)
     images = images_ahead(12)
@@ -331,7 +331,7 @@ def test_starting_pair_of_a_drive_uses_points_beside_the_road() -> None:
     xyz = np.concatenate([far, near])
     point = np.repeat(np.arange(len(xyz)), len(images))
     view = np.tile(np.arange(len(images)), len(xyz))
-    start = starting_pair(point, view, xyz, images)
+    start = initial_pair(point, view, xyz, images)
     assert start is not None
     assert len(start.points) >= 150
     assert (start.points >= len(far)).all()
@@ -340,4 +340,4 @@ def test_starting_pair_of_a_drive_uses_points_beside_the_road() -> None:
     angles = np.degrees(np.arccos((rays[:, 0] * rays[:, 1]).sum(axis=1)))
     assert np.median(angles) > 8
     only = point < len(far)
-    assert starting_pair(point[only], view[only], far, images) is None
+    assert initial_pair(point[only], view[only], far, images) is None

@@ -19,7 +19,7 @@ from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import CameraOptions
-from colmap_av1.poses.start_trials import demote_failing_starts
+from colmap_av1.poses.mapper_trials import demote_failing_starts
 from colmap_av1.util.progress import Clock
 
 CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)

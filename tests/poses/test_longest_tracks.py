@@ -16,8 +16,8 @@ from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import MapOptions
+from colmap_av1.poses.longest_tracks import LONGEST_TRACKS, keep_longest_tracks
 from colmap_av1.poses.mapper import map_poses
-from colmap_av1.poses.start_tracks import START_TRACKS, keep_start_tracks
 from colmap_av1.reconstruct import ReconstructReport
 from colmap_av1.util.progress import no_progress
 
@@ -48,9 +48,9 @@ def test_images_and_pairs_keep_their_number_of_tracks(
     made: ReconstructReport, tmp_path: Path
 ) -> None:
     database = shutil.copyfile(made.database, tmp_path / "few.db")
-    keep_start_tracks(database)
+    keep_longest_tracks(database)
     before, after = inliers_of(made.database), inliers_of(database)
-    of_image, of_pair = START_TRACKS
+    of_image, of_pair = LONGEST_TRACKS
     assert before.keys() == after.keys()
     for pair, matches in after.items():
         assert len(matches) >= min(of_pair, len(before[pair]))
@@ -68,7 +68,7 @@ def test_poses_are_as_accurate_as_with_all_tracks(
     for name in ("all", "few"):
         database = shutil.copyfile(made.database, tmp_path / f"{name}.db")
         if name == "few":
-            keep_start_tracks(database)
+            keep_longest_tracks(database)
         sizes = map_poses(
             database,
             tmp_path / name,
@@ -86,7 +86,7 @@ def test_poses_are_as_accurate_as_with_all_tracks(
 
 def test_short_tracks_across_a_gap_are_kept(tmp_path: Path) -> None:
     """The tracks on either side are longer and more than an image needs."""
-    of_image, of_pair = START_TRACKS
+    of_image, of_pair = LONGEST_TRACKS
     num_long, num_short = 3 * of_image, of_pair - 5
     rng = np.random.default_rng(0)
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=[500, 320, 240])
@@ -102,7 +102,7 @@ def test_short_tracks_across_a_gap_are_kept(tmp_path: Path) -> None:
                 for second in range(first + 1, half.stop):
                     opened.write_two_view_geometry(first, second, matching(0, num_long))
         opened.write_two_view_geometry(5, 6, matching(num_long, num_long + num_short))
-    keep_start_tracks(database)
+    keep_longest_tracks(database)
     after = inliers_of(database)
     assert len(after[5, 6]) == num_short
     assert all(len(matches) == of_image for pair, matches in after.items() if pair != (5, 6))

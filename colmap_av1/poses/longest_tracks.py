@@ -1,4 +1,4 @@
-"""Select the tracks that COLMAP's global mapper starts from.
+"""Select the longest tracks, from which COLMAP's global mapper starts.
 
 The time of global positioning and bundle adjustment is proportional to the number of observations.
 The longest tracks determine the poses nearly as well as all tracks, and another adjustment follows.
@@ -20,10 +20,10 @@ from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.graphs import connected_components
 
 # Number of tracks that each image and each pair keeps.
-START_TRACKS = 200, 30
+LONGEST_TRACKS = 200, 30
 
 
-def keep_start_tracks(database: Path) -> None:
+def keep_longest_tracks(database: Path) -> None:
     """Remove the inlier matches of all but the longest tracks from a database.
 
     Each image keeps 200 tracks and each pair 30, or all if it has fewer. Keypoints, matches and the
@@ -46,7 +46,7 @@ def keep_start_tracks(database: Path) -> None:
         pair_ids = [pair_id for pair_id, _, _ in rows]
         inliers = [matches_from_row(database, *row) for row in rows]
         ends = np.array([image_ids_from_pair_id(pair_id) for pair_id in pair_ids], np.int64)
-        kept = _on_start_tracks(num_keypoints, np.searchsorted(image_ids, ends), inliers)
+        kept = _on_longest_tracks(num_keypoints, np.searchsorted(image_ids, ends), inliers)
         connection.executemany(
             "UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?",
             [
@@ -58,7 +58,7 @@ def keep_start_tracks(database: Path) -> None:
     write_existing(database, fill)
 
 
-def _on_start_tracks(
+def _on_longest_tracks(
     num_keypoints: Ints,
     pairs: Ints,
     matches: list[NDArray[np.uint32]],
@@ -84,7 +84,7 @@ def _on_start_tracks(
     in_image = np.zeros(len(num_keypoints), np.int64)
     in_pair = np.zeros(len(pairs), np.int64)
     is_kept = np.zeros(len(images_of), np.bool_)
-    of_image, of_pair = START_TRACKS
+    of_image, of_pair = LONGEST_TRACKS
     for number in sorted(range(len(images_of)), key=lambda k: -len(images_of[k])):
         own_images, own_pairs = images_of[number], pairs_of[number]
         few_in_image = (in_image[own_images] < of_image).any()

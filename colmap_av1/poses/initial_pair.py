@@ -33,7 +33,7 @@ _SPANS = (1, 2, 3, 4, 6, 8, 11, 15, 20, 28, 40, 56)
 
 
 @dataclass(frozen=True)
-class StartingPair:
+class InitialPair:
     """An initial pair of images.
 
     Attributes:
@@ -63,12 +63,12 @@ class _Candidate:
         return self.points[self.angles >= angle]
 
 
-def starting_pair(
+def initial_pair(
     point: Ints,
     view: Ints,
     xyz: Floats,
     images: list[ModelImage],
-) -> StartingPair | None:
+) -> InitialPair | None:
     """Find the pair with the most points at a large angle, with sideways motion if possible.
 
     Args:
@@ -88,7 +88,7 @@ def starting_pair(
             counts = [len(c.wide(angle)) for c in fit]
             if counts and max(counts) >= _ENOUGH:
                 best = fit[int(np.argmax(counts))]
-                return StartingPair(*best.pair, best.wide(angle))
+                return InitialPair(*best.pair, best.wide(angle))
     return None
 
 
