@@ -77,6 +77,8 @@ def _shares_fitting(
     model: PosedModel, image_set: ImageSet, tracks: Tracks, seams: Sequence[tuple[str, str]]
 ) -> list[float | None]:
     """The share of the tracks across each seam that fit the poses; None for few tracks."""
+    if not seams:
+        return []
     order, bounds = tracks.by_frame()
     track, frame_of, poses = tracks.track, image_set.images.frame_of, model.by_name
 

@@ -88,9 +88,8 @@ def split_stage(
         if len(found[0]) < len(known.images):
             return found
         # Only now, because images that are misplaced beside a seam are dropped first.
-        few = adjusted.result.few_point_seams
-        false += jumping_seams(known, image_set, tracks, few)
-        return parts_of(known, image_set, seams, false=false, rival=other)
+        jumping = jumping_seams(known, image_set, tracks, adjusted.result.few_point_seams)
+        return parts_of(known, image_set, seams, false=[*false, *jumping], rival=other)
 
     key = [list(seams), rival.digest if rival is not None else None]
     return _parts_stage(run, mapped, adjusted, parts, name=f"parts_{number}", key=key)
