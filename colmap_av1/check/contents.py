@@ -153,18 +153,18 @@ def images_with_rows(connection: sqlite3.Connection, path: Path) -> Images:
     rows = connection.execute(
         "SELECT image_id, name, camera_id FROM images ORDER BY image_id"
     ).fetchall()
-    place = {row[0]: i for i, row in enumerate(rows)}
+    index_of = {row[0]: i for i, row in enumerate(rows)}
     keypoints = [np.empty((0, 2), dtype=np.float32)] * len(rows)
     num_columns, num_descriptors = [0] * len(rows), [-1] * len(rows)
     for image_id, *row in connection.execute("SELECT image_id, rows, cols, data FROM keypoints"):
-        if image_id in place:
-            num_columns[place[image_id]] = row[1]
+        if image_id in index_of:
+            num_columns[index_of[image_id]] = row[1]
             if row[0]:
-                keypoints[place[image_id]] = stored_keypoints(path, image_id, *row)[:, :2]
+                keypoints[index_of[image_id]] = stored_keypoints(path, image_id, *row)[:, :2]
     if columns(connection, "descriptors"):
         for image_id, count in connection.execute("SELECT image_id, rows FROM descriptors"):
-            if image_id in place:
-                num_descriptors[place[image_id]] = count
+            if image_id in index_of:
+                num_descriptors[index_of[image_id]] = count
     return Images(
         ids=np.array([row[0] for row in rows], dtype=np.int64),
         names=[row[1] for row in rows],
@@ -177,14 +177,14 @@ def images_with_rows(connection: sqlite3.Connection, path: Path) -> Images:
 
 def pairs_with_rows(connection: sqlite3.Connection, path: Path, images: Images) -> Pairs:
     """Read the pairs one by one, because all matches of a large database do not fit in memory."""
-    place = {int(image_id): i for i, image_id in enumerate(images.ids)}
+    index_of = {int(image_id): i for i, image_id in enumerate(images.ids)}
     num_matches = dict(connection.execute("SELECT pair_id, rows FROM matches").fetchall())
     matched = [np.zeros(len(k), dtype=np.bool_) for k in images.keypoints]
     rows: dict[int, tuple[int, int, float, float]] = {}
     num_points = [len(k) for k in images.keypoints]
     astray: set[int] = set()
     for pair_id, num_rows, data in connection.execute("SELECT pair_id, rows, data FROM matches"):
-        i, j = (place.get(image_id, -1) for image_id in image_ids_from_pair_id(pair_id))
+        i, j = (index_of.get(image_id, -1) for image_id in image_ids_from_pair_id(pair_id))
         found = matches_from_row(path, pair_id, num_rows, data)
         if min(i, j) >= 0 and len(found) and (found >= [num_points[i], num_points[j]]).any():
             astray.add(pair_id)
@@ -192,7 +192,7 @@ def pairs_with_rows(connection: sqlite3.Connection, path: Path, images: Images) 
         "SELECT pair_id, rows, data, config FROM two_view_geometries"
     ):
         rows[pair_id] = (num_rows, config, 0.0, 0.0)
-        i, j = (place.get(image_id, -1) for image_id in image_ids_from_pair_id(pair_id))
+        i, j = (index_of.get(image_id, -1) for image_id in image_ids_from_pair_id(pair_id))
         if min(i, j) < 0 or num_rows == 0:
             continue
         inliers = matches_from_row(path, pair_id, num_rows, data)
@@ -208,7 +208,7 @@ def pairs_with_rows(connection: sqlite3.Connection, path: Path, images: Images) 
             matched[i][a] = matched[j][b] = True
     pair_ids = np.array(sorted(rows.keys() | num_matches.keys()), dtype=np.int64)
     index = np.array(
-        [[place.get(i, -1) for i in image_ids_from_pair_id(int(p))] for p in pair_ids],
+        [[index_of.get(i, -1) for i in image_ids_from_pair_id(int(p))] for p in pair_ids],
         dtype=np.int64,
     ).reshape(-1, 2)
     listed = (index >= 0).all(axis=1)

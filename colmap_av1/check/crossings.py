@@ -117,12 +117,12 @@ def _fitting(
 
     Keypoints are undistorted with the cameras of the model.
     """
-    place = {image.name: k for k, image in enumerate(images)}
+    index_of = {image.name: k for k, image in enumerate(images)}
     with open_unaltered(database) as connection:
         of_id = {
-            image_id: place[name]
+            image_id: index_of[name]
             for image_id, name in connection.execute("SELECT image_id, name FROM images")
-            if name in place
+            if name in index_of
         }
         if not of_id:
             raise DatabaseError(

@@ -14,7 +14,7 @@ from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.util.digests import seed_of
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import grouped, indices_in
 from colmap_av1.util.threads import map_on_threads
 
 # Largest error in pixels of an inlier, and smallest number of inliers of an accepted pose, as in
@@ -68,10 +68,9 @@ def sightings_of(
     own, index = np.unique(np.searchsorted(seen.offsets, first, side="right"), return_index=True)
     point = np.full(tracks.num_tracks, -1, dtype=np.int64)
     point[in_seen[own - 1]] = index
-    place = np.full(tracks.num_frames, -1, dtype=np.int64)
-    place[frames] = np.arange(len(frames))
-    rows = np.flatnonzero((place[tracks.frame] >= 0) & (point[number] >= 0))
-    order, bounds = grouped(place[tracks.frame[rows]], len(frames))
+    image = indices_in(frames, tracks.num_frames)[tracks.frame]
+    rows = np.flatnonzero((image >= 0) & (point[number] >= 0))
+    order, bounds = grouped(image[rows], len(frames))
     rows = rows[order]
     xy = tracks.xy[rows].astype(np.float64)
     rays = np.empty(xy.shape)

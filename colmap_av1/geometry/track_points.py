@@ -18,7 +18,7 @@ from colmap_av1.geometry.undistortion import Undistortion
 from colmap_av1.options import TrackOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats, Ints, Picture
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import grouped, indices_in
 from colmap_av1.util.progress import Progress, no_progress
 
 # If a smaller share of the tracks agrees with the poses, the model is not of the same video.
@@ -58,10 +58,8 @@ def chaining_for_points(
 
 def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, Ints]:
     """The tracks restricted to some frames, and the index into `frames` of each observation."""
-    place = np.full(tracks.num_frames, -1, dtype=np.int64)
-    place[frames] = np.arange(len(frames))
     seen = tracks.keep_frames(frames)
-    return seen, place[seen.frame]
+    return seen, indices_in(frames, tracks.num_frames)[seen.frame].astype(np.int64)
 
 
 def tracks_of_points(

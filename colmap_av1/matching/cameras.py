@@ -21,6 +21,7 @@ from colmap_av1.images.photos import Photo
 from colmap_av1.matching.focal import estimate_focal_length
 from colmap_av1.matching.matched_images import PairedImages
 from colmap_av1.options import CameraOptions
+from colmap_av1.util.grouping import indices_in
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.metadata.lens import container_focal_length
 
@@ -142,9 +143,7 @@ def _some_images(paired: PairedImages, images: Sequence[int]) -> PairedImages:
     """Select images, given in ascending order, and the pairs among them."""
     if len(images) == len(paired.keypoints):
         return paired
-    index = np.full(len(paired.keypoints), -1, dtype=np.int32)
-    index[list(images)] = np.arange(len(images))
-    pairs = index[paired.pairs]
+    pairs = indices_in(np.array(images), len(paired.keypoints))[paired.pairs]
     kept = np.flatnonzero((pairs >= 0).all(axis=1))
     return PairedImages(
         [paired.keypoints[i] for i in images], pairs[kept], [paired.matches[k] for k in kept]

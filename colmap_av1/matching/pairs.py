@@ -12,7 +12,7 @@ from colmap_av1.errors import ImageError
 from colmap_av1.options import PairOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Ints
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import grouped, indices_in
 
 # Spans up to this many images are paired at every image. Longer spans are paired at every n-th
 # image only, where n grows with the span, so the number of pairs stays linear in the number of
@@ -72,9 +72,7 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
             "in display order"
         )
 
-    image_of_frame = np.full(tracks.num_frames, -1, dtype=np.int64)
-    image_of_frame[chosen] = np.arange(chosen.size)
-    image = image_of_frame[tracks.frame]
+    image = indices_in(chosen, tracks.num_frames)[tracks.frame]
     num_tracks = tracks.num_tracks
     track = tracks.track
     seen = image >= 0

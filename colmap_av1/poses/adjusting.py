@@ -272,8 +272,8 @@ def used_observations(points: ModelPoints, num_images: int, mean: float) -> Bool
     most = max(_FEWEST_KEPT, 1 + int(np.searchsorted(np.cumsum(at_least), wanted)))
     point = points.point
     share = np.minimum(1.0, most / lengths)[point]
-    place = np.arange(len(point)) - points.offsets[point]
+    rank = np.arange(len(point)) - points.offsets[point]
     phase = (0.5 + _PHASE_STEP * point) % 1.0
-    used = np.floor((place + 1) * share + phase) > np.floor(place * share + phase)
+    used = np.floor((rank + 1) * share + phase) > np.floor(rank * share + phase)
     poor = np.bincount(points.image, minlength=num_images) <= mean
     return np.asarray(used | poor[points.image])

@@ -113,15 +113,15 @@ def _three_observations(tracks: Tracks, view: Ints) -> Bools:
     begin, end = view[first], view[last]
     # Observations are sorted by track, then by image.
     num_views = int(view.max(initial=0)) + 1
-    place = tracks.track * num_views + view
+    key = tracks.track * num_views + view
     # If no span has all three observations, their distances are arbitrary.
     chosen = np.column_stack([first, (first + last) // 2, last])
     left = np.arange(tracks.num_tracks)
     for span in reversed(SPANS):
         start = np.where(left % 2 == 0, begin[left], end[left] - span)
         wanted = (left * num_views + start)[:, None] + [0, span // 2, span]
-        found = np.searchsorted(place, wanted)
-        exist = (np.take(place, found, mode="clip") == wanted).all(axis=1)
+        found = np.searchsorted(key, wanted)
+        exist = (np.take(key, found, mode="clip") == wanted).all(axis=1)
         exist &= span <= end[left] - begin[left]
         chosen[left[exist]] = found[exist]
         left = left[~exist]

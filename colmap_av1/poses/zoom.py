@@ -122,19 +122,19 @@ def _with_copies(
             models, which would otherwise be confused with the copies.
     """
     count = Counter(image.camera_id for image in model.images)
-    place = dict.fromkeys(count, 0)
+    rank = dict.fromkeys(count, 0)
     cameras, images = dict(model.cameras), []
     copies: dict[tuple[int, int], int] = {}
     for image in model.images:
         number = image.camera_id
         num_copies = count[number] // num_images if number in shared else 1
         if num_copies > 1:
-            part = number, min(place[number] // num_images, num_copies - 1)
+            part = number, min(rank[number] // num_images, num_copies - 1)
             if part not in copies:
                 copies[part] = last + len(copies) + 1
                 cameras[copies[part]] = copy.copy(model.cameras[number])
                 cameras[copies[part]].camera_id = copies[part]
-            place[number] += 1
+            rank[number] += 1
             number = copies[part]
         images.append(replace(image, camera_id=number))
     used = {image.camera_id for image in images}

@@ -15,7 +15,7 @@ from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import TrackOptions
 from colmap_av1.util.arrays import Bools, Ints
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import grouped, indices_in
 from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.display import Display, shown_points, shown_size
@@ -220,10 +220,9 @@ class Tracks:
         Args:
             frames: int32 [n] display indices, ascending.
         """
-        number = np.full(self.num_frames, -1, dtype=np.int32)
-        number[frames] = np.arange(len(frames), dtype=np.int32)
         seen = self.keep_frames(frames)
-        return replace(seen, num_frames=len(frames), frame=number[seen.frame])
+        frame = indices_in(frames, self.num_frames)[seen.frame]
+        return replace(seen, num_frames=len(frames), frame=frame)
 
     def keep_tracks(self, kept: Bools) -> Tracks:
         """Keep some of the tracks, in the same order.
@@ -274,16 +273,16 @@ class Tracks:
         added = np.repeat(repeats, [len(copy) for copy in copies])
         frame = np.concatenate([self.frame, added.astype(np.int32)])
         track = self.track[source]
-        place = np.lexsort([frame, track])
+        by_track = np.lexsort([frame, track])
         lengths = np.bincount(track, minlength=self.num_tracks)
         return replace(
             self,
             num_frames=len(first),
             offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
-            frame=frame[place],
-            xy=self.xy[source[place]],
-            sigma=self.sigma[source[place]],
-            confirmed=self.confirmed[source[place]],
+            frame=frame[by_track],
+            xy=self.xy[source[by_track]],
+            sigma=self.sigma[source[by_track]],
+            confirmed=self.confirmed[source[by_track]],
         )
 
     def every_nth(self, n: int) -> Tracks:
@@ -294,8 +293,8 @@ class Tracks:
         """Split each track into equal parts of at most `max_length` observations."""
         lengths = self.lengths
         part = -(-lengths // -(-lengths // max_length))
-        place = np.arange(self.num_observations) - np.repeat(self.offsets[:-1], lengths)
-        starts = np.flatnonzero(place % np.repeat(part, lengths) == 0)
+        rank = np.arange(self.num_observations) - np.repeat(self.offsets[:-1], lengths)
+        starts = np.flatnonzero(rank % np.repeat(part, lengths) == 0)
         offsets = np.append(starts, self.num_observations).astype(np.int64)
         return replace(self, offsets=offsets)
 
@@ -358,9 +357,8 @@ class Tracks:
         kept = (x >= 0) & (x <= size[0]) & (y >= 0) & (y <= size[1])
         if presented is not None:
             presented = presented[presented < self.num_frames]
-            number = np.full(self.num_frames, -1, dtype=np.int32)
-            number[presented] = np.arange(len(presented), dtype=np.int32)
-            shown = replace(shown, num_frames=len(presented), frame=number[self.frame])
+            frame = indices_in(presented, self.num_frames)[self.frame]
+            shown = replace(shown, num_frames=len(presented), frame=frame)
             kept &= shown.frame >= 0
         return shown.keep_observations(kept)
 

@@ -1,4 +1,4 @@
-"""Elements grouped by an integer, such as observations by their image."""
+"""Elements grouped or selected by an integer, such as observations by their image."""
 
 from __future__ import annotations
 
@@ -26,6 +26,21 @@ def grouped(key: NDArray[np.integer[Any]], num_groups: int) -> tuple[Ints, Ints]
     bounds = np.zeros(num_groups + 1, np.int64)
     np.cumsum(np.bincount(key, minlength=num_groups), out=bounds[1:])
     return order, bounds
+
+
+def indices_in(chosen: NDArray[np.integer[Any]], count: int) -> NDArray[np.int32]:
+    """The index of each number in an array of distinct numbers.
+
+    Args:
+        chosen: integers [n], distinct, from 0 to below `count`.
+        count: how many numbers there are.
+
+    Returns:
+        int32 [count]; -1 for the numbers that are not in `chosen`.
+    """
+    index = np.full(count, -1, np.int32)
+    index[chosen] = np.arange(len(chosen), dtype=np.int32)
+    return index
 
 
 def take_rows(offsets: Ints, rows: Ints) -> tuple[Ints, Ints]:

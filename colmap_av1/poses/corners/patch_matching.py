@@ -24,7 +24,7 @@ from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.slopes import surface_slopes
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Floats, Ints, Picture
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import grouped, indices_in
 from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.threads import map_on_threads
 
@@ -211,10 +211,9 @@ def _found_in(
     index, expected, change = _in_view(number, patches, view, size)
     if len(index) == 0:
         return index, expected
-    place = np.full(len(patches.xyz), -1)
-    place[followed] = np.arange(len(followed))
-    seen = place[index] >= 0
-    expected[seen] = at[place[index[seen]]] / scale
+    rank = indices_in(followed, len(patches.xyz))[index]
+    seen = rank >= 0
+    expected[seen] = at[rank[seen]] / scale
     grey = pictures.read(number)
     found, error, correlation = _core.find_patches(
         patches.grey,
