@@ -232,20 +232,18 @@ def _run_column(
     own = name.startswith(f"{_OWN}-") or name == _OWN
     total = 3 if own and options.all_tracks else 2
     column = Column(name)
+    seconds, cpu_seconds = dict[str, float](), dict[str, float]()
     if own and conversion is not None:  # the others need no AV1 stream
-        column = replace(
-            column,
-            seconds={"encoding": conversion.seconds},
-            cpu_seconds={"conversion": conversion.cpu_seconds},
-        )
+        seconds["encoding"] = conversion.seconds
+        cpu_seconds["conversion"] = conversion.cpu_seconds
     progress(name, 0, total)
     try:
         run = run_frontend(name, footage, folder / "matches", frontend)
         column = replace(
             column,
             warnings=run.warnings,
-            seconds={**run.seconds, **column.seconds},
-            cpu_seconds={**column.cpu_seconds, "matching": run.cpu_seconds},
+            seconds={**run.seconds, **seconds},
+            cpu_seconds={**cpu_seconds, "matching": run.cpu_seconds},
             peak_memory=run.peak_memory,
         )
         progress(name, 1, total)

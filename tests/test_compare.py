@@ -24,7 +24,14 @@ from colmap_av1.evaluate.frontends.learned import pairs_of
 from colmap_av1.evaluate.report.results import Column
 from colmap_av1.evaluate.training.trainers import match_renders
 from colmap_av1.interop.hloc import export_hloc
-from colmap_av1.options import CameraOptions, CompareOptions, ImageOptions, MatchOptions
+from colmap_av1.options import (
+    CameraOptions,
+    CompareOptions,
+    ImageOptions,
+    MatchOptions,
+    ReadOptions,
+    RunOptions,
+)
 
 pytest.importorskip("matplotlib")
 
@@ -369,7 +376,8 @@ def test_conversion_counts_as_cost_of_motion(video, ffmpeg, tmp_path):
     assert 0 < motion.cpu_seconds["conversion"] < sum(motion.cpu_seconds.values())
     assert "conversion" not in sift.cpu_seconds
     # A run that keeps the stream keeps its cost.
-    fewer = replace(options, match=replace(OPTIONS, images=ImageOptions(every=8)))
+    fewer = replace(OPTIONS, images=ImageOptions(every=8), read=ReadOptions(strict=True))
+    fewer = replace(options, match=replace(fewer, run=RunOptions(num_threads=1)))
     (again, _) = compare(other, tmp_path / "report", options=fewer).columns
     assert again.cpu_seconds["conversion"] == motion.cpu_seconds["conversion"]
 

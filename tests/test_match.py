@@ -313,6 +313,9 @@ def test_images_are_spread_over_the_frames_before_the_damage(
     assert names[-1] == f"frame_{report.num_frames - 1:06d}.png"
     assert report.num_inliers > 0
     assert len(report.warnings) == 1
+    again = replace(few, on_existing="replace")
+    repeated = match(tmp_path / "a.db", hurt, image_path=tmp_path / "few", options=again)
+    assert (repeated.num_images, repeated.num_written_images) == (4, 0)
 
 
 def test_database_is_written_although_the_mapper_crashes(

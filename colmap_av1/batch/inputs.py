@@ -80,7 +80,7 @@ def list_videos(inputs: Sequence[str], output: str, stall: float) -> tuple[list[
     - a pattern of file names,
     - a video,
     - any other file: a list with one video on each line, as a path relative to the list or a URL,
-      optionally followed by a tab and a name; lines that start with '#' are ignored.
+      optionally followed by a tab and a name; lines that start with '# ' are ignored.
 
     A video's default name is its path without suffix, relative to the folder, to the fixed part of
     the pattern or to the list's folder; for a video elsewhere it is the file name.
@@ -189,7 +189,7 @@ def _of_list(word: str) -> Iterator[tuple[str, str]]:
             # File names need not be valid UTF-8.
             text = os.fsdecode(line.removeprefix(mark).rstrip(b"\r\n"))
             address, tab, name = text.partition("\t")
-            if not address.strip() or address.startswith("#"):
+            if not address.strip() or address.startswith("# "):
                 continue
             if not is_url(address) and folder and address[0] != "/":
                 address = f"{folder}/{address}"

@@ -26,7 +26,7 @@ def add_arguments(command: Parser) -> None:
         nargs="+",
         metavar="PATH",
         help="paths or URLs of videos, folders, quoted patterns, or lists (on each line a path or "
-        "URL, optionally followed by a tab and a name)",
+        "URL, optionally followed by a tab and a name, or '# ' and a comment)",
     )
     command.add_argument(
         "--output",

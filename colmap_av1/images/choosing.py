@@ -182,10 +182,13 @@ def choose_images(
             chosen = _keep_images_of_model(chosen, existing)
         if existing and {*existing} != {*chosen.names}:
             way = "num_images" if options.fps is None else "fps"
+            other = "" if of_model else ", or give a new database and folder"
             raise OptionError(
-                f"{way} chooses other images than the {len(existing)} that exist: leave it out, or "
-                "give a new database and folder"
+                f"{way} chooses other images than the {len(existing)} that exist: leave it out"
+                f"{other}"
             )
+        if existing:
+            _check_ends(chosen, folder, decode)
     if len(chosen.frames) < 2:
         remedy = "add images of other frames" if existing else "choose more frames"
         if num_frames < 2:
@@ -298,13 +301,19 @@ def _read_entries(
             name = indexed[2] or options.file_name % frame
         else:
             name = line
-            found, extension = last_number(name), PurePosixPath(name).suffix[1:]
-            if found is None or not extension.isalnum() or extension.isdecimal():
+            found = last_number(name)
+            if found is None:
                 raise ImageError(
                     f"{path}, line {number}: '{name}' is neither the index of a frame nor the name "
                     "of an image with a number"
                 )
             frame = found - (options.first_number or 0)
+        extension = PurePosixPath(name).suffix[1:]
+        if not extension.isalnum() or extension.isdecimal():
+            raise ImageError(
+                f"{path}, line {number}: '{name}' is not the name of an image: give one index and "
+                "optionally one file name per line"
+            )
         entries.append((number, frame, name))
     if not entries:
         raise ImageError(f"{path}: lists no frame: give a frame's index on each line")
@@ -329,8 +338,6 @@ def _find_existing(
 ) -> ChosenImages:
     """Find the frames of existing images."""
     by_name = [names[i] for i in natural_order(names)]
-    file_of = {name: image_file(folder, name) for name in by_name} if folder is not None else {}
-    file_of = {name: file for name, file in file_of.items() if file.exists()}
     if options.frame_list is not None:
         chosen = read_frame_list(options.frame_list, num_frames, options)
         if of_model:
@@ -349,28 +356,34 @@ def _find_existing(
         try:
             frames = frames_of_images(by_name, num_frames, options.first_number)
         except ImageError as error:
-            if options.first_number is not None or not file_of:
+            files = [image_file(folder, name) for name in by_name] if folder is not None else []
+            missing = [n for n, file in zip(by_name, files, strict=False) if not file.exists()]
+            if options.first_number is not None or len(missing) == len(files):
                 raise
-            missing = [name for name in by_name if name not in file_of]
             if missing:
                 raise ImageError(
-                    f"{folder}: lacks {len(missing)} of the {len(names)} images, such as "
-                    f"'{missing[0]}', so that content does not identify them: restore these files, "
-                    "or list the images in a --frame_list"
+                    f"{error}; {folder} lacks {len(missing)} of the {len(names)} images, such as "
+                    f"'{missing[0]}', and content identifies them only if all are there"
                 ) from error
-            return _by_content(by_name, list(file_of.values()), decode)
+            return _by_content(by_name, files, decode)
         chosen = _in_order(by_name, frames)
-    there = [k for k, name in enumerate(chosen.names) if name in file_of]
-    if there:
-        # A wrong start or rate shows at the first or the last image.
-        ends = sorted({there[0], there[-1]})
-        frames_of_ends = chosen.frames[ends].tolist()
-        check_content(
-            [file_of[chosen.names[k]] for k in ends],
-            frames_of_ends,
-            decode(frames_near(frames_of_ends)),
-        )
+    _check_ends(chosen, folder, decode)
     return chosen
+
+
+def _check_ends(chosen: ChosenImages, folder: Path | None, decode: _Decode) -> None:
+    """Check the content of the first and the last image that are in a folder.
+
+    They show a wrong start or rate.
+    """
+    if folder is None:
+        return
+    files = [image_file(folder, name) for name in chosen.names]
+    there = [k for k, file in enumerate(files) if file.exists()]
+    if there:
+        ends = sorted({there[0], there[-1]})
+        frames = chosen.frames[ends].tolist()
+        check_content([files[k] for k in ends], frames, decode(frames_near(frames)))
 
 
 def _keep_images_of_model(chosen: ChosenImages, names: Sequence[str]) -> ChosenImages:
@@ -423,8 +436,12 @@ def _at_steps(names: Sequence[str], num_frames: int, options: ImageOptions) -> N
                 f"'{name}' would be frame {number * step} of the video, which has frames 0 to "
                 f"{num_frames - 1}: give another every or first_number"
             )
-    if len(set(numbers)) < len(numbers):
-        raise ImageError("two images have the same number: list their frames in a --frame_list")
+    twice = next((k for k, n in enumerate(numbers) if n in numbers[:k]), None)
+    if twice is not None:
+        raise ImageError(
+            f"'{names[numbers.index(numbers[twice])]}' and '{names[twice]}' have the same number: "
+            "list their frames in a --frame_list"
+        )
     return np.array(numbers, dtype=np.int32) * step
 
 

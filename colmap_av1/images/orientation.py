@@ -64,16 +64,18 @@ def _way_back(
     """The rotation from shown pictures to existing images; None if they have the same orientation.
 
     It follows from the shape of the images. If both orientations fit, the content of the first
-    image decides, if its file exists. Otherwise images are assumed to be rotated as players and
+    image whose file exists decides. Otherwise images are assumed to be rotated as players and
     FFmpeg show them.
     """
     display = video.display
     if display.turn == UPRIGHT or not existing:
         return None
     back = turned_back(display)
-    name, size = next(iter(existing.items()))
+    size = next(iter(existing.values()))
     as_shown = has_shape(size, video.picture_size)
     as_stored = has_shape(size, shown_size(video.picture_size, back))
-    if as_shown and as_stored and folder is not None and (folder / name).exists():
-        return back if is_turned_back(folder / name, decode_frames(video), display) else None
+    files = (folder / name for name in existing) if folder is not None else ()
+    file = next((file for file in files if file.exists()), None)
+    if as_shown and as_stored and file is not None:
+        return back if is_turned_back(file, decode_frames(video), display) else None
     return back if as_stored and not as_shown else None

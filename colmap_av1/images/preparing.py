@@ -139,7 +139,7 @@ def prepare_images(
         names, frames = found.chosen.names, found.chosen.frames.tolist()
         check_image_folder(folder, names, size)
         kept = [(n, f) for n, f in zip(names, frames, strict=True) if (folder / n).exists()]
-        if kept and (not existing or options.images.is_spread):
+        if not existing and kept:
             # Another program may have numbered other frames than the pattern does.
             some = dict([kept[0], kept[min(_CHECKED, len(kept) - 1)]])
             pictures = decode_pictures(

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import ImageError, VideoError
+from colmap_av1.errors import ImageError, OptionError, VideoError
 from colmap_av1.images.choosing import ChosenImages, choose_images
 from colmap_av1.images.masks import VideoMasks
 from colmap_av1.options import ImageOptions, ReadOptions, TrackingOptions
@@ -144,7 +144,7 @@ def track_chosen_images(
         with context.clock.measure("choice"), warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             chosen = choose(num_frames)
-    except ImageError:
+    except (ImageError, OptionError):
         return track(choose_by_tracks)
 
     def choose_again(tracked: TrackedVideo) -> ChosenImages:

@@ -56,7 +56,7 @@ def contradicted_seams(
 def jumping_seams(
     model: PosedModel, image_set: ImageSet, tracks: Tracks, seams: Sequence[tuple[str, str]]
 ) -> list[tuple[str, str]]:
-    """The seams without tracks across which the camera moves too fast.
+    """The seams with fewer than 30 tracks across which the camera moves too fast.
 
     Args:
         model: the poses.

@@ -214,16 +214,15 @@ def model_long_range_errors(
         progress: called for the stage "long range".
 
     Raises:
-        ImageError: an image is missing, unreadable or of another size than its camera.
+        ImageError: all images are missing, or one that is needed is missing, unreadable or of
+            another size than its camera.
     """
     posed = posed_images(reconstruction)
     names = list(posed)
     images = [posed[names[k]] for k in natural_order(names)]
-    missing = next((name for name in names if not image_file(image_path, name).is_file()), None)
-    if missing is not None:
+    if not any(image_file(image_path, name).is_file() for name in names):
         raise ImageError(
-            f"{image_path}: lacks the model's image '{missing}': give the folder of the model's "
-            "images"
+            f"{image_path}: has none of the model's images: give the folder of the model's images"
         )
 
     def points_of(index: int) -> Floats:

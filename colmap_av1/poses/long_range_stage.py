@@ -68,7 +68,7 @@ def long_range_stage(
         posed: the stage that estimated the poses.
         masks_digest: digest of the stage that made the masks; None without masks.
         searched_loops: whether loop closures have been searched in all videos.
-        number: number of the adjustment that the poses are from, which names the stage.
+        number: 1 for the check of the whole model, else the number of the adjustment after a split.
     """
 
     def make(_: Path) -> LongRangeResult:

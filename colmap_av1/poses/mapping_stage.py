@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -89,7 +88,7 @@ def mapping_stage(
                 if attempt.mapper == "global" and mapping.adjust:
                     keep_longest_tracks(database)
                 try:
-                    found = mapped_models(run, database, attempt, effort, keyed.images.names)
+                    found = mapped_models(run, database, attempt, effort, len(keyed.sequence))
                 except ModelError:
                     if attempt is attempts[-1]:
                         raise
@@ -129,7 +128,7 @@ def mapping_stage(
 
 
 def mapped_models(
-    run: Run, database: Path, options: MapOptions, effort: MapperEffort, names: Sequence[str]
+    run: Run, database: Path, options: MapOptions, effort: MapperEffort, num_images: int
 ) -> list[PosedModel]:
     """Map a database, and read the models of more than a few images, with their points.
 
@@ -138,7 +137,7 @@ def mapped_models(
         database: the database, which pycolmap may change.
         options: options of the mapper.
         effort: see `map_poses`.
-        names: names of its images.
+        num_images: number of its images.
 
     Raises:
         ModelError: the mapper fails.
@@ -150,7 +149,7 @@ def mapped_models(
             options,
             image_path=None,
             log=run.stages / "mapper.log",
-            num_images=len(names),
+            num_images=num_images,
             progress=run.progress,
             effort=effort,
         )

@@ -8,7 +8,8 @@ parallax, which determines their relative scale.
 
 With wrong poses, points may seem to have parallax: while a camera turns, a motion to the side looks
 much like a rotation. If the images were mapped twice, and the second result fits the observations
-hardly better than the first, the places must have parallax in both.
+hardly better than the first, the places must have parallax in both. The places may also look alike
+only: see `false_links`.
 
 Models that may bend, and all models but the first, also lose images at the ends of their videos,
 until the positions of the others are certain.
@@ -61,10 +62,13 @@ def split_stage(
     seams: Sequence[tuple[str, str]],
     *,
     tracks: Tracks,
+    whole: Tracks,
     rival: Kept[AdjustedResult] | None,
     number: int,
 ) -> Kept[MappedResult]:
-    """Split an adjusted model at its seams.
+    """Split an adjusted model at its seams, see `parts_of`.
+
+    It is also split where false links bend it, see `false_links`.
 
     Args:
         run: the run.
@@ -73,6 +77,7 @@ def split_stage(
         adjusted: the first of these, adjusted.
         seams: names of the images before and after each seam where it may be split.
         tracks: the tracks of all videos.
+        whole: these tracks before earlier splits, which cut them at all seams.
         rival: see `Posed`.
         number: number of the next adjustment.
 
@@ -87,8 +92,11 @@ def split_stage(
         found = parts_of(known, image_set, seams, false=false, rival=other)
         if len(found[0]) < len(known.images):
             return found
-        # Only now, because images that are misplaced beside a seam are dropped first.
-        jumping = jumping_seams(known, image_set, tracks, adjusted.result.few_point_seams)
+        # Only if nothing else splits the model: a split and another adjustment may remove the
+        # misplaced images that make the camera seem fast.
+        jumping = jumping_seams(known, image_set, whole, adjusted.result.few_point_seams)
+        if not jumping:
+            return found
         return parts_of(known, image_set, seams, false=[*false, *jumping], rival=other)
 
     key = [list(seams), rival.digest if rival is not None else None]

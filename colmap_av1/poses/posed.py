@@ -337,6 +337,7 @@ def split_at_seams(
         other stages must not be used.
     """
     may_bend = only_certain
+    whole = posed.tracks
     for number in count(_FIRST_SPLIT):
         if posed.adjustment is None:
             break
@@ -351,6 +352,7 @@ def split_at_seams(
                 posed.adjustment,
                 seams,
                 tracks=posed.tracks,
+                whole=whole,
                 rival=posed.rival,
                 number=number,
             )

@@ -188,7 +188,7 @@ def _map_tracks(
         write_matches(database, names, cameras, matched)
         keep_longest_tracks(database)
         try:
-            found = mapped_models(run, database, map_options, "early", names)
+            found = mapped_models(run, database, map_options, "early", len(names))
         except ModelError:  # the first mapping is there
             return None
     return _with_camera_ids(found[0], known) if found else None

@@ -66,6 +66,7 @@ class VideoSource:
             a converted stream.
         is_kept: whether the stream is kept after the run.
         conversion: description of the conversion; None if there was none.
+        is_reused: whether another run converted the video, and kept the stream.
         kept: store of decoded pictures; None: pictures are decoded each time.
     """
 
@@ -73,6 +74,7 @@ class VideoSource:
     pictures: Video
     is_kept: bool = True
     conversion: str | None = None
+    is_reused: bool = False
     kept: KeptPictures | None = None
 
     @property
@@ -188,7 +190,7 @@ def _made_source(
     conversion = f"{video.codec} at {shown} to AV1 at {size} by {made.encoder}"
     if video.is_interlaced:
         conversion += ", deinterlaced"
-    return VideoSource(stream, video, is_kept, conversion)
+    return VideoSource(stream, video, is_kept, conversion, made.reused)
 
 
 def with_stream_kept(options: MatchOptions, folder: Path, name: str = "") -> MatchOptions:

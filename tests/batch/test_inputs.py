@@ -40,7 +40,7 @@ def test_folders_and_patterns_are_expanded(folder: Path) -> None:
 
 def test_lists_have_paths_urls_and_names(folder: Path) -> None:
     videos = folder.parent / "videos.txt"
-    lines = ["videos/sub/c.v1.MP4", f"{folder}/b.mp4\tscene/first", "", "../x/e.mp4\r"]
+    lines = ["# mine", "videos/sub/c.v1.MP4", f"{folder}/b.mp4\tscene/first", "", "../x/e.mp4\r"]
     videos.write_text("\n".join([*lines, "https://host/f.mp4?key=1", "s3://bucket/dir/g.mkv"]))
     assert names(videos) == ["videos/sub/c.v1", "scene/first", "e", "f", "g"]
     found, num_repeated = list_videos([str(videos), str(videos)], OUT, 5)

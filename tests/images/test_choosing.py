@@ -161,6 +161,8 @@ def test_frame_list_is_read(tmp_path: Path) -> None:
         ("5\n", "10"),
         ("", "no frame"),
         ("0\n-1\n", "line 2"),
+        ("0,5\n", "line 1"),
+        ("0, 5, 7\n", "line 1"),
         ("img1.png 0\n", "line 1"),
         ("img1.png,0\n", "line 1"),
         ("1.5\n", "line 1"),
@@ -432,6 +434,10 @@ def test_a_choice_can_be_repeated_on_its_own_database(
     other = replace(options, images=ImageOptions(num_images=7))
     with pytest.raises(OptionError, match="exist"):
         match(database, clip, image_path=folder, options=other)
+    last = sorted(folder.iterdir())[-1]
+    cv2.imwrite(str(last), np.full((128, 192, 3), 99, np.uint8))
+    with pytest.raises(ImageError, match=last.name):
+        match(database, clip, image_path=folder, options=options)
 
 
 def test_images_that_cannot_be_read_cause_a_warning(clip: Path, tmp_path: Path) -> None:
@@ -439,6 +445,29 @@ def test_images_that_cannot_be_read_cause_a_warning(clip: Path, tmp_path: Path) 
     (tmp_path / "images" / "0.webp").write_bytes(b"RIFF")
     with pytest.warns(UserWarning, match=r"0\.webp"):
         match(tmp_path / "a.db", clip, image_path=tmp_path / "images")
+
+
+def test_ignored_subfolders_cause_a_warning(clip: Path, tmp_path: Path) -> None:
+    (tmp_path / "images" / "camera").mkdir(parents=True)
+    (tmp_path / "images" / "camera" / "1.png").touch()
+    with pytest.warns(UserWarning, match="camera"):
+        match(tmp_path / "a.db", clip, image_path=tmp_path / "images")
+
+
+@pytest.mark.parametrize("missing", [(), ("x0.png",)])
+def test_orientation_is_that_of_the_images_that_are_there(
+    clip: Path, cut: list[np.ndarray], ffmpeg: Ffmpeg, tmp_path: Path, missing: tuple[str, ...]
+) -> None:
+    """Both orientations have the same shape, so the content of an image decides."""
+    turned = ffmpeg(*("-display_rotation", "180", "-i", clip, "-c", "copy"), tmp_path / "t.mp4")
+    folder, database = save(tmp_path / "stored", cut[::5]), tmp_path / "a.db"
+    pycolmap.Database.open(database).close()
+    pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE)
+    for name in missing:
+        (folder / name).unlink()
+    report = match(database, turned, image_path=folder, options=_every(5))
+    assert report.num_written_images == len(missing)
+    np.testing.assert_array_equal(cv2.imread(str(folder / "x0.png")), cut[0])
 
 
 def test_images_that_another_program_numbered_from_1_are_not_of_an_earlier_run(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -83,8 +84,8 @@ def convert(
         progress: called with the stage "encoding".
 
     Returns:
-        The cost, small if an earlier run of another command kept the stream; None if the video is
-        AV1.
+        The cost; None if it is unknown, because another run kept the stream, or if the video needs
+        no conversion.
 
     Raises:
         ColmapAv1Error: see `match`.
@@ -94,12 +95,14 @@ def convert(
         context = RunContext.of(options.run, progress=progress)
         start = cpu_seconds()
         with open_source(video, options.source, next_to=folder, context=context) as source:
-            is_converted = source.conversion is not None
+            is_new = source.conversion is not None and not source.is_reused
         cost = Conversion(context.clock.seconds.get("encoding", 0.0), cpu_seconds() - start)
-        return {"cost": asdict(cost) if is_converted else None}
+        return {"cost": asdict(cost) if is_new else None}
 
-    depends_on = [file_digest(video.path), options.read, options.encode, options.reencode]
-    found = run_stage_in(folder, depends_on, make, products=[], timed=True).result["cost"]
+    # Other code than that of the conversion does not change the cost of the stream that is kept.
+    depends_on = [file_digest(video.path), options.encode, options.reencode]
+    stage = run_stage_in(folder, depends_on, make, products=[], made_by=("video",))
+    found = stage.result["cost"]
     return Conversion(**found) if found is not None else None
 
 
@@ -163,7 +166,9 @@ def choose_footage(
     # A folder that is not given only holds images that this stage wrote.
     existing = list[str]()
     if image_path is not None:
-        existing = existing_images(images, options.images, video.picture_size)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # `prepare_images` gives them
+            existing = existing_images(images, options.images, video.picture_size)
     depends_on = [
         file_digest(video.path),
         given,

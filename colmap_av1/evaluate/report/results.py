@@ -26,7 +26,7 @@ class Column:
         error: why results are missing; empty if there was no error.
         warnings: warnings about the results.
         seconds: wall time of each stage.
-        cpu_seconds: CPU time of the stages "conversion" of a video that is not AV1, "matching",
+        cpu_seconds: CPU time of the stages "conversion", if the video was converted, "matching",
             "mapping" and "all tracks".
         peak_memory: largest resident memory of any stage in bytes; None if unknown.
         num_models: number of models from the mapper; the one with the most images is measured.

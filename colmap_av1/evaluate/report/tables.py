@@ -154,7 +154,8 @@ def cost_table(columns: Sequence[Column]) -> Table:
         row.append(", ".join(f"{k} {v:.1f}" for k, v in column.seconds.items()) or _NONE)
         rows.append(row)
     about = (
-        "Motion needs a conversion to AV1 if the video has another codec. Every other stage ran in "
+        "Motion needs a conversion to AV1 if the video has another codec; its cost is unknown if "
+        "another run kept the stream. Every other stage ran in "
         "a separate process; matching includes reading or extraction, matching and "
         "verification. If the machine was running other work at the same time, compare CPU "
         "times, not wall times."

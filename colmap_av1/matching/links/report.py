@@ -79,7 +79,7 @@ class LinkReport:
             names = ", ".join(f"'{name}'" for part in self.parts for name in part)
             return (
                 f"--links none does not connect {names}: they become separate models unless other "
-                "matches of the database connect them",
+                "matches connect them; leave it out to connect them by SIFT features",
             )
         groups = " with ".join(", ".join(f"'{name}'" for name in part) for part in self.parts)
         return (

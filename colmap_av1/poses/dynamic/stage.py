@@ -98,11 +98,10 @@ def without_dynamic_tracks(
     }
     if not by_frame:
         return tracks
-    min_length = MIN_IMAGES
-    if len(images.frames) == image_set.num_frames:  # else the length in frames is not known
-        options = chaining_for_points(run.options.match.tracks, run.options.triangulate)
-        min_length = least_length(options)
-    return mask_tracks(tracks, by_frame, min_length, scaled=False)
+    options = chaining_for_points(run.options.match.tracks, run.options.triangulate)
+    # Tracks may be kept in the images only, so frames without an observation count as well.
+    masked = mask_tracks(tracks, by_frame, MIN_IMAGES, scaled=False)
+    return masked.keep_lasting(least_length(options))
 
 
 def without_dynamic_links(
