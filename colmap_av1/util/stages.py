@@ -18,9 +18,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, get_args
 
 import cattrs
+import numpy as np
 
 from colmap_av1.errors import OptionError, WriteError, writing
 from colmap_av1.util.digests import (
@@ -39,6 +40,19 @@ WHOLE_PACKAGE = (".",)
 
 _Result = TypeVar("_Result")
 _Found_co = TypeVar("_Found_co", covariant=True)
+
+
+def _is_array(kind: Any) -> bool:
+    return kind is np.ndarray or getattr(kind, "__origin__", None) is np.ndarray
+
+
+# Results with fields that JSON lacks: arrays (their type is `NDArray[...]`) and None.
+_CONVERTER = cattrs.Converter()
+_CONVERTER.register_unstructure_hook_func(_is_array, lambda array: array.tolist())
+_CONVERTER.register_structure_hook_func(
+    _is_array, lambda values, kind: np.array(values, get_args(get_args(kind)[1])[0])
+)
+_CONVERTER.register_structure_hook(type(None), lambda value, _: value)
 
 
 @dataclass(frozen=True)
@@ -133,8 +147,8 @@ def run_stage(
         name: name of the stage.
         depends_on: everything that the result depends on, except the code of this package and
             the versions of libraries, see `digest_of`.
-        kind: dataclass of the result; its fields have types that JSON can hold, or are such
-            dataclasses.
+        kind: dataclass of the result; its fields have types that JSON can hold, or are arrays or
+            such dataclasses.
         products: files and folders that the stage writes.
         make: writes the products to the given folder and returns the result.
         into: folder for the products; None: the folder of the stages.
@@ -165,12 +179,13 @@ def run_stage(
 def run_stage_in(
     folder: Path,
     depends_on: Sequence[Any],
-    make: Callable[[], dict[str, Any]],
+    kind: Any,
+    make: Callable[[], _Result],
     *,
     products: Sequence[Path],
     made_by: Sequence[str] = WHOLE_PACKAGE,
     timed: bool = False,
-) -> Kept[dict[str, Any]]:
+) -> Kept[_Result]:
     """Run a stage that has its own folder, unless an earlier run finished it.
 
     The products are written in their final place, for programs that record the path of their
@@ -179,7 +194,8 @@ def run_stage_in(
     Args:
         folder: emptied before the stage runs; contains `result.json` and the output of the stage.
         depends_on: everything except the code that the result depends on, see `digest_of`.
-        make: writes the products and returns a result that JSON can hold.
+        kind: type of the result, as in `run_stage`; also None, a tuple or an optional type.
+        make: writes the products and returns the result.
         products: files and folders that later stages read, in the folder or elsewhere.
         made_by: folders of this package whose code changes the result, see `code_digest`. If other
             programs make the result, folders whose code only makes their input are not listed.
@@ -190,12 +206,12 @@ def run_stage_in(
     """
     key = _stage_key(depends_on, made_by=made_by, timed=timed)
     record = folder / "result.json"
-    finished = _finished(record, key, folder, dict[str, Any])
+    finished: Kept[_Result] | None = _finished(record, key, folder, kind)
     if finished is not None:
         return finished
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    return _record(record, key, make(), dict[str, Any], into=folder, products=products)
+    return _record(record, key, make(), kind, into=folder, products=products)
 
 
 def _stage_key(
@@ -343,7 +359,7 @@ def _record(
         for path in _files_of(product)
     }
     # The record is parsed again, so that this run continues with the values a later run will read.
-    plain = {"key": key, "result": cattrs.unstructure(result), "files": files}
+    plain = {"key": key, "result": _CONVERTER.unstructure(result), "files": files}
     body = json.loads(json.dumps(plain))
     _write_record(record, body)
     return _kept(body, kind, resumed=False)
@@ -358,7 +374,7 @@ def _files_of(product: Path) -> list[Path]:
 def _kept(body: dict[str, Any], kind: type[_Result], *, resumed: bool) -> Kept[_Result]:
     contents = {name: file["digest"] for name, file in body["files"].items()}
     identity = {"key": body["key"], "result": body["result"], "contents": contents}
-    return Kept(cattrs.structure(body["result"], kind), _json_digest(identity), resumed)
+    return Kept(_CONVERTER.structure(body["result"], kind), _json_digest(identity), resumed)
 
 
 def _json_digest(body: Any) -> str:

@@ -139,14 +139,13 @@ def real_sequence(case: Case, folder: Path, console: Console) -> Material:
     words = ffmpeg_input(source, sequence.fps)
     video = folder / "video" / "video.mp4"
 
-    def encode() -> dict[str, Any]:
+    def encode() -> None:
         console.print(f"{case.name}: encoding", markup=False)
         ffmpeg(*words, *ENCODING.split(), str(video))
-        return {"bytes": video.stat().st_size}
 
     pictures = sorted(source.iterdir()) if source.is_dir() else [source]
     given = (words, ENCODING, [file_digest(p) for p in pictures])
-    run_stage_in(video.parent, given, encode, products=[video], made_by=())
+    run_stage_in(video.parent, given, None, encode, products=[video], made_by=())
     return Material(
         video, sequence.num_frames, sequence.camera, sequence.cam_from_world, source=words
     )
@@ -199,11 +198,10 @@ def as_shot(sequence: Sequence, folder: Path) -> Path:
     words = (*ffmpeg_input(sequence.source, sequence.fps), "-c:v", "libx264", "-preset")
     words += ("veryfast", "-crf", "14", "-pix_fmt", "yuv420p")
 
-    def make() -> dict[str, Any]:
+    def make() -> None:
         ffmpeg(*words, str(video))
-        return {}
 
-    run_stage_in(folder, words, make, products=[video], made_by=())
+    run_stage_in(folder, words, None, make, products=[video], made_by=())
     return video
 
 

@@ -176,17 +176,19 @@ def converted(source: Path, folder: Path, setting: EncodeOptions) -> tuple[Path,
     """The stream of a setting, and the CPU time of ffmpeg."""
     stream = folder / "stream.mp4"
 
-    def make() -> dict[str, Any]:
+    def make() -> float:
         before = os.times()
         stream_of(source, stream, options=setting)
         after = os.times()
         spent = after.children_user + after.children_system
-        return {"cpu_seconds": spent - before.children_user - before.children_system}
+        return spent - before.children_user - before.children_system
 
     given = (file_digest(source), setting)
     made_by = ("video",)
-    facts = run_stage_in(folder, given, make, products=[stream], made_by=made_by, timed=True).result
-    return stream, facts["cpu_seconds"]
+    spent = run_stage_in(
+        folder, given, float, make, products=[stream], made_by=made_by, timed=True
+    ).result
+    return stream, spent
 
 
 def modelled(
@@ -219,7 +221,7 @@ def modelled(
         return facts
 
     given = (file_digest(source), file_digest(stream), images, camera)
-    facts = run_stage_in(folder, given, make, products=[]).result
+    facts = run_stage_in(folder, given, dict[str, Any], make, products=[]).result
     facts.pop("message", None)
     return facts
 

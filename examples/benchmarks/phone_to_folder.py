@@ -208,7 +208,9 @@ def measure_match(clip: Clip, folder: Path) -> list[Row]:
         }
 
     given = [file_digest(clip.video), clip.images, clip.camera, pycolmap.__version__]
-    made = run_stage_in(database.parent, given, fill, products=[database, images], timed=True)
+    made = run_stage_in(
+        database.parent, given, dict[str, Any], fill, products=[database, images], timed=True
+    )
     command = str(made.result["command"])
     num_images = int(made.result["num_images"])
     matched = row_of(clip, "match", made.result["taken"])
@@ -297,7 +299,9 @@ def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str
     source = file_digest(clip.video)
     converted = None
     if not is_av1:
-        kept = run_stage_in(stream.parent, [source], convert, products=[stream], timed=True)
+        kept = run_stage_in(
+            stream.parent, [source], dict[str, Any], convert, products=[stream], timed=True
+        )
         converted = kept.result
     keep_stream = None if is_av1 else stream
     # Trained renderings are compared with the pictures, so these are lossless.
@@ -311,7 +315,9 @@ def folder_of(clip: Clip, folder: Path) -> tuple[dict[str, Any] | None, dict[str
         return taken(run_measured(run_reconstruct, clip.video, output, options, log=log))
 
     given = [source, clip.images, clip.camera]
-    made = run_stage_in(output.parent, given, make, products=[output], timed=True).result
+    made = run_stage_in(
+        output.parent, given, dict[str, Any], make, products=[output], timed=True
+    ).result
     return converted, made, output
 
 
@@ -356,10 +362,17 @@ def sift_of(
         return {"features": taken(extracted), "matches": taken(matched)}
 
     given: list[Any] = [file_digest(clip.video), names]
-    written = run_stage_in(images.parent, given, write, products=[images], timed=True).result
+    written = run_stage_in(
+        images.parent, given, dict[str, Any], write, products=[images], timed=True
+    ).result
     given = [*given, clip.camera, pycolmap.__version__]
     matching = run_stage_in(
-        database.parent, given, extract_and_match, products=[database], timed=True
+        database.parent,
+        given,
+        dict[str, dict[str, Any]],
+        extract_and_match,
+        products=[database],
+        timed=True,
     ).result
     steps = {"frames": written, **matching}
     if not mapped:

@@ -6,7 +6,6 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -126,12 +125,11 @@ def prepare_footage(
         camera=camera,
     )
 
-    def make() -> dict[str, Any]:
+    def make() -> None:
         footage.image_path.mkdir()
         write_images(opened, footage.image_path, footage.names, frames)
-        return {}
 
-    run_stage_in(folder, [file_digest(video), frames], make, products=[footage.image_path])
+    run_stage_in(folder, [file_digest(video), frames], None, make, products=[footage.image_path])
     return footage
 
 

@@ -128,14 +128,13 @@ def undistorted(
     """The undistorted images and model that `make` returns, made once for the same `given`."""
     images, model = folder / "images", folder / "model"
 
-    def run() -> dict[str, Any]:
+    def run() -> None:
         pictures, distorted = make()
         images.mkdir()
         undistort_images(distorted, pictures, images)
         undistort_model(distorted, model)
-        return {}
 
-    run_stage_in(folder, given, run, products=[images, model])
+    run_stage_in(folder, given, None, run, products=[images, model])
     return images, model
 
 

@@ -214,13 +214,12 @@ def source_footage(footage: Footage, material: Material, folder: Path) -> Footag
     words = material.source
     images = folder / "source" / "images"
 
-    def make() -> dict[str, Any]:
+    def make() -> None:
         images.mkdir()
         ffmpeg(*words, "-start_number", "0", str(images / "frame_%06d.png"))
-        return {}
 
     given = (words, file_digest(footage.video))
-    run_stage_in(images.parent, given, make, products=[images], made_by=())
+    run_stage_in(images.parent, given, None, make, products=[images], made_by=())
     return replace(footage, image_path=images)
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from colmap_av1.errors import VideoError
 from colmap_av1.geometry.cameras import make_camera
@@ -30,33 +29,42 @@ from colmap_av1.video.facts import Video
 from colmap_av1.video.unchanged import unchanged
 
 
-@dataclass(frozen=True)
-class Footage:
-    """The input of every front-end.
+@dataclass(frozen=True, kw_only=True)
+class ChosenImages:
+    """The frames of a video that become images.
 
     Attributes:
-        video: the video.
-        image_path: folder of the images, decoded from the video or from its original.
         names: file names of the images, in display order.
         frames: frame index of each image.
         num_frames: number of shown frames of the video.
         size: (width, height) of the images in pixels.
         pixel_aspect: width of a pixel over its height.
-        camera: camera options of all images.
         forward_motion: whether the camera moves along its optical axis, see `MatchReport`.
         warnings: warnings from choosing the images.
     """
 
-    video: Path
-    image_path: Path
     names: list[str]
     frames: tuple[int, ...]
     num_frames: int
     size: tuple[int, int]
     pixel_aspect: float
-    camera: CameraOptions
     forward_motion: bool = False
     warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footage(ChosenImages):
+    """The input of every front-end.
+
+    Attributes:
+        video: the video.
+        image_path: folder of the images, decoded from the video or from its original.
+        camera: camera options of all images.
+    """
+
+    video: Path
+    image_path: Path
+    camera: CameraOptions
 
 
 @dataclass(frozen=True)
@@ -91,19 +99,18 @@ def convert(
         ColmapAv1Error: see `match`.
     """
 
-    def make() -> dict[str, Any]:
+    def make() -> Conversion | None:
         context = RunContext.of(options.run, progress=progress)
         start = cpu_seconds()
         with open_source(video, options.source, next_to=folder, context=context) as source:
             is_new = source.conversion is not None and not source.is_reused
         cost = Conversion(context.clock.seconds.get("encoding", 0.0), cpu_seconds() - start)
-        return {"cost": asdict(cost) if is_new else None}
+        return cost if is_new else None
 
     # Other code than that of the conversion does not change the cost of the stream that is kept.
     depends_on = [file_digest(video.path), options.encode, options.reencode]
-    stage = run_stage_in(folder, depends_on, make, products=[], made_by=("video",))
-    found = stage.result["cost"]
-    return Conversion(**found) if found is not None else None
+    kind = Conversion | None
+    return run_stage_in(folder, depends_on, kind, make, products=[], made_by=("video",)).result
 
 
 def choose_footage(
@@ -129,7 +136,7 @@ def choose_footage(
     """
     images = image_path if image_path is not None else folder / "images"
 
-    def make() -> dict[str, Any]:
+    def make() -> ChosenImages:
         context = RunContext.of(options.run, progress=progress)
         with unchanged(video.state) as check_video:
             prepared = prepare_images(
@@ -143,15 +150,15 @@ def choose_footage(
             chosen = prepared.tracked.chosen
             check_video()
             write_prepared(prepared, images, options.reading, progress)
-        return {
-            "names": chosen.names,
-            "frames": chosen.frames.tolist(),
-            "num_frames": prepared.tracked.tracks.num_frames,
-            "size": prepared.size,
-            "pixel_aspect": prepared.pixel_aspect,
-            "forward_motion": _is_forward_motion(prepared, video.path, options),
-            "warnings": prepared.tracked.video.warnings,
-        }
+        return ChosenImages(
+            names=chosen.names,
+            frames=tuple(chosen.frames.tolist()),
+            num_frames=prepared.tracked.tracks.num_frames,
+            size=prepared.size,
+            pixel_aspect=prepared.pixel_aspect,
+            forward_motion=_is_forward_motion(prepared, video.path, options),
+            warnings=prepared.tracked.video.warnings,
+        )
 
     given = (
         options.images,
@@ -176,10 +183,8 @@ def choose_footage(
         digest_if_there(options.images.frame_list),
         [file_digest(images / name) for name in existing],
     ]
-    facts = run_stage_in(folder, depends_on, make, products=[images]).result
-    for name in ("frames", "size", "warnings"):
-        facts[name] = tuple(facts[name])
-    return Footage(video=video.path, image_path=images, camera=options.camera, **facts)
+    chosen = run_stage_in(folder, depends_on, ChosenImages, make, products=[images]).result
+    return Footage(**vars(chosen), video=video.path, image_path=images, camera=options.camera)
 
 
 def frame_list(footage: Footage, path: Path) -> str:

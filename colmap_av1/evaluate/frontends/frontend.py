@@ -10,7 +10,7 @@ from typing import Any
 import pycolmap
 
 from colmap_av1.evaluate.frontends.footage import Footage
-from colmap_av1.evaluate.frontends.measure import run_measured
+from colmap_av1.evaluate.frontends.measure import Measured, run_measured
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.util.digests import digest_of, file_digest
 from colmap_av1.util.stages import WHOLE_PACKAGE, run_stage_in
@@ -89,27 +89,28 @@ def run_frontend(name: str, footage: Footage, folder: Path, frontend: Frontend) 
     """
     database = folder / "database.db"
 
-    def make() -> dict[str, Any]:
-        measured = run_measured(frontend.run, footage, database, log=folder / "log.txt")
-        return {
-            "seconds": measured.result.seconds,
-            "warnings": measured.result.warnings,
-            "cpu_seconds": measured.cpu_seconds,
-            "peak_memory": measured.peak_memory,
-        }
+    def make() -> Measured[Filled]:
+        return run_measured(frontend.run, footage, database, log=folder / "log.txt")
 
     camera = replace(footage.camera, camera_model=camera_model(footage))
     given = (name, file_digest(footage.video), footage.frames, camera)
-    finished = run_stage_in(
+    made = run_stage_in(
         folder,
         [*given, *frontend.depends_on(footage)],
+        Measured[Filled],
         make,
         products=[database],
         made_by=frontend.made_by,
         timed=True,
+    ).result
+    return FrontendRun(
+        name,
+        database,
+        seconds=made.result.seconds,
+        warnings=made.result.warnings,
+        cpu_seconds=made.cpu_seconds,
+        peak_memory=made.peak_memory,
     )
-    warnings = tuple(finished.result.pop("warnings"))
-    return FrontendRun(name, database, warnings=warnings, **finished.result)
 
 
 def camera_model(footage: Footage) -> str:

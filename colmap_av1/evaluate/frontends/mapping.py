@@ -5,14 +5,13 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import pycolmap
 
 from colmap_av1.densify import densify
 from colmap_av1.evaluate.frontends.footage import Footage, frame_list
 from colmap_av1.evaluate.frontends.frontend import OF_OTHERS
-from colmap_av1.evaluate.frontends.measure import run_measured
+from colmap_av1.evaluate.frontends.measure import Measured, run_measured
 from colmap_av1.options import DensifyOptions, ImageOptions, MapOptions
 from colmap_av1.poses.mapper import run_mapper
 from colmap_av1.util.digests import file_digest
@@ -58,29 +57,31 @@ def measure_mapper(
     """
     model = folder / "model"
 
-    def make() -> dict[str, Any]:
+    def make() -> Measured[int]:
         # Map a copy: pycolmap migrates a database to its own layout.
         copy = folder / "mapped.db"
         shutil.copyfile(database, copy)
         measured = run_measured(_map, copy, image_path, model, options, log=folder / "log.txt")
         copy.unlink()
-        return {
-            "num_models": measured.result,
-            "seconds": measured.seconds,
-            "cpu_seconds": measured.cpu_seconds,
-            "peak_memory": measured.peak_memory,
-        }
+        return measured
 
-    finished = run_stage_in(
+    made = run_stage_in(
         folder,
         [file_digest(database), options, pycolmap.__version__],
+        Measured[int],
         make,
         products=[model],
         made_by=(*OF_OTHERS, "geometry", "poses"),
         timed=True,
+    ).result
+    return MapperRun(
+        model / "0" if made.result else None,
+        num_models=made.result,
+        warnings=(),
+        seconds=made.seconds,
+        cpu_seconds=made.cpu_seconds,
+        peak_memory=made.peak_memory,
     )
-    found = model / "0" if finished.result["num_models"] else None
-    return MapperRun(found, warnings=(), **finished.result)
 
 
 def densify_model(
@@ -101,26 +102,26 @@ def densify_model(
     """
     output = folder / "model"
 
-    def make() -> dict[str, Any]:
+    def make() -> Measured[tuple[str, ...]]:
         images = ImageOptions(frame_list=frame_list(footage, folder / "frames.txt"))
         given = replace(options, match=replace(options.match, images=images))
-        measured = run_measured(
-            _densify, model, footage.video, output, given, log=folder / "log.txt"
-        )
-        return {
-            "num_models": 1,
-            "warnings": measured.result,
-            "seconds": measured.seconds,
-            "cpu_seconds": measured.cpu_seconds,
-            "peak_memory": measured.peak_memory,
-        }
+        log = folder / "log.txt"
+        return run_measured(_densify, model, footage.video, output, given, log=log)
 
     inputs = [file_digest(path) for path in (footage.video, *sorted(model.glob("*.bin")))]
     # The location of the stream does not change the result.
     anywhere = replace(options, match=replace(options.match, keep_stream=None))
     given = (inputs, footage.names, footage.frames, anywhere)
-    made = run_stage_in(folder, given, make, products=[output], timed=True).result
-    return MapperRun(output, warnings=tuple(made.pop("warnings")), **made)
+    kind = Measured[tuple[str, ...]]
+    made = run_stage_in(folder, given, kind, make, products=[output], timed=True).result
+    return MapperRun(
+        output,
+        num_models=1,
+        warnings=made.result,
+        seconds=made.seconds,
+        cpu_seconds=made.cpu_seconds,
+        peak_memory=made.peak_memory,
+    )
 
 
 def _map(database: Path, image_path: Path, output: Path, options: MapOptions) -> int:

@@ -12,9 +12,8 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np  # before pycolmap: the other order breaks writing PNG files later
+import numpy  # noqa: F401 - before pycolmap: the other order breaks writing PNG files later
 import pycolmap
 
 from colmap_av1.errors import EvaluationError
@@ -85,6 +84,14 @@ class Training:
     metrics: RenderingMetrics
 
 
+@dataclass(frozen=True)
+class _Trained:
+    """What is kept of a training: the wall time of its command, and its milestones."""
+
+    seconds: float
+    states: tuple[Milestone, ...]
+
+
 def check_trainer(trainer: str) -> None:
     """Refuse a trainer that cannot run.
 
@@ -122,7 +129,7 @@ def write_split(model: Path, image_path: Path, folder: Path) -> Split:
             f"{model}: one image cannot be split for training and test: give a larger model"
         )
 
-    def make() -> dict[str, Any]:
+    def make() -> None:
         run_measured(_undistort, model, image_path, split.whole, registered, log=folder / "log.txt")
         halves = split_images(registered)
         for part, names in zip((split.train, split.test), halves, strict=True):
@@ -132,11 +139,10 @@ def write_split(model: Path, image_path: Path, folder: Path) -> Split:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 _link(split.whole / "images" / name, target)
             _write_part(split.whole / "sparse" / "0", part / "sparse" / "0", set(names))
-        return {}
 
     files = [*sorted(model.glob("*.bin")), *(image_path / name for name in registered)]
     given = ([file_digest(file) for file in files], pycolmap.__version__)
-    run_stage_in(folder, given, make, products=[split.whole, split.train, split.test])
+    run_stage_in(folder, given, None, make, products=[split.whole, split.train, split.test])
     return split
 
 
@@ -186,7 +192,7 @@ def train(
     stops = tuple(sorted({stop for stop in milestones if stop < iterations}))
     stops = (*stops, iterations) if trainer == GSPLAT or "{milestones}" in trainer else ()
 
-    def make() -> dict[str, Any]:
+    def make() -> _Trained:
         for path in (folder / "output", renders):
             path.mkdir()
         if trainer == GSPLAT:
@@ -200,19 +206,19 @@ def train(
         measured = run_measured(_run, command, folder / "log.txt", log=folder / "log.txt")
         if not stops:
             match_renders(renders, references)  # Raise before the result is marked as finished.
-        states = [_plain(state) for state in _states(renders, stops, references)]
-        return {"seconds": measured.seconds, "states": states}
+        return _Trained(measured.seconds, _states(renders, stops, references))
 
     # The command may name a script, which can change. Other words may be too long for `Path`.
     words = words_of_trainer(trainer) if trainer != GSPLAT else []
     scripts = [file_digest(Path(word)) for word in words if os.path.isfile(word)]
     depends_on = (trainer, scripts, given, iterations, stops)
-    finished = run_stage_in(folder, depends_on, make, products=[renders], made_by=_CODE)
-    states = tuple(_milestone(state) for state in finished.result["states"])
+    kind, products = _Trained, [renders]
+    trained = run_stage_in(folder, depends_on, kind, make, products=products, made_by=_CODE).result
+    states = trained.states
     last = renders / str(iterations) if states else renders
     files = match_renders(last, references)
     metrics = states[-1].metrics if states else rendering_metrics(files, references)
-    seconds = finished.result["seconds"]
+    seconds = trained.seconds
     if states and not math.isnan(states[-1].seconds):
         seconds = states[-1].seconds
     return Training(seconds, states, names, references, files, metrics)
@@ -277,7 +283,9 @@ def _repeated(names: Iterable[str]) -> str | None:
     return next((name for name, count in Counter(names).items() if count > 1), None)
 
 
-def _states(renders: Path, stops: Sequence[int], references: Sequence[Path]) -> list[Milestone]:
+def _states(
+    renders: Path, stops: Sequence[int], references: Sequence[Path]
+) -> tuple[Milestone, ...]:
     """The milestones that a command rendered, with their times if it reported them.
 
     Raises:
@@ -289,7 +297,7 @@ def _states(renders: Path, stops: Sequence[int], references: Sequence[Path]) -> 
         files = match_renders(renders / str(stop), references)
         seconds, gaussians = times.get(stop, (math.nan, None))
         states.append(Milestone(stop, seconds, gaussians, rendering_metrics(files, references)))
-    return states
+    return tuple(states)
 
 
 def _read_times(path: Path) -> dict[int, tuple[float, int | None]]:
@@ -318,22 +326,6 @@ def _positive(word: str) -> float:
     if not 0 < value < math.inf:
         raise ValueError(word)
     return value
-
-
-def _plain(state: Milestone) -> dict[str, Any]:
-    metrics = {
-        name: value.tolist() if isinstance(value, np.ndarray) else value
-        for name, value in vars(state.metrics).items()
-    }
-    return {**vars(state), "metrics": metrics}
-
-
-def _milestone(plain: dict[str, Any]) -> Milestone:
-    metrics: dict[str, Any] = {
-        name: np.array(value) if isinstance(value, list) else value
-        for name, value in plain["metrics"].items()
-    }
-    return Milestone(**{**plain, "metrics": RenderingMetrics(**metrics)})
 
 
 def _run(command: Sequence[str], log: Path) -> None:
