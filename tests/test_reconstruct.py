@@ -301,7 +301,7 @@ def test_damaged_files_are_written_again(copy: Path) -> None:
     before = contents(copy)
     for name in (".stages/tracks.npz", ".stages/dynamic.npz", "images/frame_000006.jpg"):
         (copy / name).unlink()
-    for name in ("database.db", ".stages/placed.npz"):
+    for name in ("database.db", ".stages/resected.npz"):
         os.truncate(copy / name, (copy / name).stat().st_size - 1)
     for name in (".stages/poses/0.npz", "sparse/0/points3D.bin"):
         (copy / name).write_bytes(bytes((copy / name).stat().st_size))

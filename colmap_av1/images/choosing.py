@@ -178,16 +178,16 @@ def choose_images(
         if folder is not None and options.skip_blurred and options.is_spread:
             frames = skip_blurred(frames, lambda asked: sharpness_of(decode(set(asked))))
         chosen = ChosenImages(image_names(options.file_name, frames.tolist()), frames)
-        if existing and of_model:
-            chosen = _keep_images_of_model(chosen, existing)
-        if existing and {*existing} != {*chosen.names}:
-            way = "num_images" if options.fps is None else "fps"
-            other = "" if of_model else ", or give a new database and folder"
-            raise OptionError(
-                f"{way} chooses other images than the {len(existing)} that exist: leave it out"
-                f"{other}"
-            )
         if existing:
+            if of_model:
+                chosen = _keep_images_of_model(chosen, existing)
+            if {*existing} != {*chosen.names}:
+                way = "num_images" if options.fps is None else "fps"
+                other = "" if of_model else ", or give a new database and folder"
+                raise OptionError(
+                    f"{way} chooses other images than the {len(existing)} that exist: leave it out"
+                    f"{other}"
+                )
             _check_ends(chosen, folder, decode)
     if len(chosen.frames) < 2:
         remedy = "add images of other frames" if existing else "choose more frames"

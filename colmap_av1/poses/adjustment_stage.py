@@ -114,35 +114,37 @@ def adjustment_stage(
     has_gaps = bool(dynamic_masks) or has_changing_masks(image_set)
 
     def make(partial: Path) -> AdjustedResult:
-        placed = read_posed_images(run, posed, image_set)
+        registered = read_posed_images(run, posed, image_set)
         # Not kept in a variable: the long tracks need several times the memory of the selection.
-        spread = select_tracks(pose_tracks(run, tracks).keep_frames(placed.frames), _ADJUSTED)
+        spread = select_tracks(pose_tracks(run, tracks).keep_frames(registered.frames), _ADJUSTED)
         if has_picture_positions and has_gaps:
             with run.clock.measure("refinement"):
-                spread = follow_behind(run, dynamic_masks, spread, placed)
-        linked = links.keep_frames(placed.frames)
+                spread = follow_behind(run, dynamic_masks, spread, registered)
+        linked = links.keep_frames(registered.frames)
         sets = [(spread, FOR_POSES), (linked, FOR_POSES)]
         if has_picture_positions:
             with run.clock.measure("refinement"):
                 guide = Tracks.concatenate(spread, linked)
-                followed, placed = corners_in_images(run, dynamic_masks, guide, placed)
+                followed, registered = corners_in_images(run, dynamic_masks, guide, registered)
             few = spread.every_nth(_NTH_WITH_CORNERS).split_to_length(_LENGTH_WITH_CORNERS)
             sets = [(few, _WITH_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
         with run.clock.measure("adjustment"):
-            points = [_triangulated_points(run, placed, *own) for own in sets]
+            points = [_triangulated_points(run, registered, *own) for own in sets]
             check_agreement(sum(len(own.xyz) for own in points), spread.num_tracks)
             run.progress("adjustment", 0, 1)
-            model = PosedModel(placed.cameras, placed.images, ModelPoints.concatenate(points))
+            model = PosedModel(
+                registered.cameras, registered.images, ModelPoints.concatenate(points)
+            )
             iterative = len(model.images) >= _ITERATIVE_IMAGES and not is_fast
             adjusted = adjust_posed(run, model, iterative=iterative)
             run.progress("adjustment", 1, 1)
-            registered = without_unseen_images(adjusted.model)
+            trimmed = without_unseen_images(adjusted.model)
         names = image_set.images.names
         photos = names[image_set.photos.start :]
-        seams = model_seams(registered.model, photos, names)
+        seams = model_seams(trimmed.model, photos, names)
         with run.clock.measure("adjustment"):
-            own = with_own_cameras(run, registered.model)
-        kept = adjusted.kept_points[registered.kept_points][own.kept_points]
+            own = with_own_cameras(run, trimmed.model)
+        kept = adjusted.kept_points[trimmed.kept_points][own.kept_points]
         is_motion = kept < len(points[0].xyz)
         result = own.model
         write_posed_model(partial / f"adjusted{suffix}.npz", result)
@@ -178,8 +180,8 @@ def adjustment_stage(
 
 
 def _triangulated_points(
-    run: Run, placed: PosedImages, tracks: Tracks, options: TriangulateOptions
+    run: Run, registered: PosedImages, tracks: Tracks, options: TriangulateOptions
 ) -> ModelPoints:
     """Triangulated points of tracks in the registered images, without colours."""
-    seen, view, points = triangulate_in(run, placed, tracks, options)
+    seen, view, points = triangulate_in(run, registered, tracks, options)
     return to_model_points(points, view, seen)

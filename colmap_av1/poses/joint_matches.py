@@ -152,31 +152,33 @@ def match_jointly(
             own = tried.poses
             models.append(_model_of(own.run, own.posed, own.image_set))
     first = models[0]
-    models.sort(key=lambda model: -len(model.placed.images))
-    registered = {image.name for model in models for image in model.placed.images}
-    not_registered = [name for name in image_set.images.names if name not in registered]
+    models.sort(key=lambda model: -len(model.registered.images))
+    in_models = {image.name for model in models for image in model.registered.images}
+    not_registered = [name for name in image_set.images.names if name not in in_models]
     num_images = len(image_set.sequence)
     # Images of uncertain models count, because without the estimate their models would be bent.
-    if len(lost.union(registered)) <= (1 - _MAX_LEFT) * num_images:
+    if len(lost.union(in_models)) <= (1 - _MAX_LEFT) * num_images:
         raise ModelError(
-            f"the joint estimate registers only {len(registered)} of {num_images} images: match "
+            f"the joint estimate registers only {len(in_models)} of {num_images} images: match "
             "them pair by pair with --verify pairs"
         )
     with run.clock.measure("pairs"):
         others = tracks_of_unregistered(run, posed, image_set, not_registered, density)
-        model_of = models_of_images(others, [model.placed.frames for model in models], image_set)
+        model_of = models_of_images(
+            others, [model.registered.frames for model in models], image_set
+        )
         others = within_models(others, not_registered, model_of, image_set)
         agreeing = [_agreeing_tracks(model, image_set, others, density) for model in models]
         paired = _paired(run, image_set, agreeing, others, density)
     cameras = joint_cameras(
-        run, image_set, [(m.known, {i.name for i in m.placed.images}) for m in models]
+        run, image_set, [(m.known, {i.name for i in m.registered.images}) for m in models]
     )
     matched = verify_images(paired, cameras, run.options.match.verify, run.context)
     warnings = _warnings(far, models, not_registered, others, image_set)
     if first.adjusted.seams_warning is not None:
         warnings.append(first.adjusted.seams_warning)
     matches = posed.matches.result
-    in_first = {image.name for image in first.placed.images}
+    in_first = {image.name for image in first.registered.images}
     focal = [
         camera.mean_focal_length()
         for camera, name in zip(cameras, image_set.images.names, strict=True)
@@ -192,7 +194,7 @@ def match_jointly(
         depth=matches.depth,
         warnings=(*matches.warnings, *warnings),
         estimate=JointEstimate(
-            num_registered=tuple(len(model.placed.images) for model in models),
+            num_registered=tuple(len(model.registered.images) for model in models),
             long_range=far.median if far is not None else None,
             long_range_largest=far.largest if far is not None else None,
             dynamic_share=posed.dynamic.result.share if posed.dynamic is not None else None,
@@ -210,19 +212,19 @@ class _Model:
         run: its run.
         adjusted: its adjustment.
         known: its poses and points.
-        placed: its registered images, except those of an earlier model.
+        registered: its registered images, except those of an earlier model.
         tracks: the tracks that poses are estimated from, in these images.
     """
 
     run: Run
     adjusted: AdjustedResult
     known: PosedModel
-    placed: PosedImages
+    registered: PosedImages
     tracks: Tracks
 
     def poses_of(self, image_set: ImageSet) -> list[Floats | None]:
         """float64 [3, 4] cam_from_world of each image; None if it is not in the model."""
-        pose_of = {image.name: image.cam_from_world for image in self.placed.images}
+        pose_of = {image.name: image.cam_from_world for image in self.registered.images}
         return [pose_of.get(name) for name in image_set.images.names]
 
 
@@ -230,9 +232,9 @@ def _model_of(run: Run, posed: Posed, image_set: ImageSet) -> _Model:
     """The finished model of a run, with those of its images that are in the set."""
     assert posed.adjustment is not None  # `match` always adjusts
     known = read_poses(run, posed.last)
-    placed = posed_images_of(known, image_set)
-    tracks = pose_tracks(run, posed.tracks).keep_frames(placed.frames)
-    return _Model(run, posed.adjustment.result, known, placed, tracks)
+    registered = posed_images_of(known, image_set)
+    tracks = pose_tracks(run, posed.tracks).keep_frames(registered.frames)
+    return _Model(run, posed.adjustment.result, known, registered, tracks)
 
 
 @dataclass(frozen=True)
@@ -240,13 +242,13 @@ class _Agreeing:
     """Tracks that agree with the poses of a model, in its registered images.
 
     Attributes:
-        placed: the registered images.
+        registered: the registered images.
         tracks: the tracks, without outliers: first the corners, then motion tracks.
         num_corners: number of corners.
         start: the initial pair for a mapper, and the tracks to match it by; None if there is none.
     """
 
-    placed: PosedImages
+    registered: PosedImages
     tracks: Tracks
     num_corners: int
     start: InitialPair | None
@@ -263,7 +265,7 @@ def _agreeing_tracks(
         others: tracks with observations in images that are not registered.
         density: which motion tracks are selected.
     """
-    run, placed = model.run, model.placed
+    run, registered = model.run, model.registered
     corners, corner_points = _agreeing_corners(model, image_set)
     repeated = at_same_place(corners, others, _SAME_TRACK)
     corners, corner_points = corners.keep_tracks(~repeated), corner_points[~repeated]
@@ -272,12 +274,12 @@ def _agreeing_tracks(
     # `matched_observations` applies the limit per image, which depends on what each track keeps.
     some = select_tracks(every, replace(density, max_tracks_per_image=0))
     some = some.keep_tracks(~at_same_place(some, corners, _SAME_POINT))
-    motion, motion_points = _agreeing_motion(run, some, placed)
+    motion, motion_points = _agreeing_motion(run, some, registered)
     both = Tracks.concatenate(corners, motion)
-    start = _start(both, np.concatenate([corner_points, motion_points]), placed)
+    start = _start(both, np.concatenate([corner_points, motion_points]), registered)
     if start is None:
-        wide, points = _agreeing_motion(run, every, placed)
-        start = _start(wide, points, placed)
+        wide, points = _agreeing_motion(run, every, registered)
+        start = _start(wide, points, registered)
         if start is not None:
             of_pair = np.zeros(wide.num_tracks, np.bool_)
             of_pair[start.points] = True
@@ -286,7 +288,7 @@ def _agreeing_tracks(
             motion = motion.keep_tracks(~at_same_place(motion, first, _SAME_TRACK))
             both = Tracks.concatenate(corners, motion, first)
             start = replace(start, points=np.arange(both.num_tracks)[-first.num_tracks :])
-    return _Agreeing(placed, both, corners.num_tracks, start)
+    return _Agreeing(registered, both, corners.num_tracks, start)
 
 
 def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, Floats]:
@@ -297,22 +299,22 @@ def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, Float
     agrees = errors <= max(_LEAST_ERROR, _MEDIAN_ERRORS * float(np.median(errors)))
     # Points of motion tracks come first.
     agrees &= adjusted.track >= model.adjusted.num_motion_points
-    agrees &= np.isin(adjusted.frame, model.placed.frames)
+    agrees &= np.isin(adjusted.frame, model.registered.frames)
     enough = np.bincount(adjusted.track[agrees], minlength=adjusted.num_tracks) >= NUM_OBSERVATIONS
     kept = adjusted.keep_observations(agrees & enough[adjusted.track])
     return kept, known.points.xyz[enough]
 
 
-def _agreeing_motion(run: Run, tracks: Tracks, placed: PosedImages) -> tuple[Tracks, Floats]:
+def _agreeing_motion(run: Run, tracks: Tracks, registered: PosedImages) -> tuple[Tracks, Floats]:
     """Motion tracks that have a point, without outliers, and their points."""
-    seen, _, points = triangulate_in(run, placed, tracks, _POINTS)
+    seen, _, points = triangulate_in(run, registered, tracks, _POINTS)
     return seen.take(points.observation, points.offsets), points.xyz
 
 
-def _start(tracks: Tracks, points: Floats, placed: PosedImages) -> InitialPair | None:
+def _start(tracks: Tracks, points: Floats, registered: PosedImages) -> InitialPair | None:
     """The initial pair for a mapper, see `initial_pair`."""
-    view = np.searchsorted(placed.frames, tracks.frame)
-    start = initial_pair(tracks.track, view, points, placed.images)
+    view = np.searchsorted(registered.frames, tracks.frame)
+    start = initial_pair(tracks.track, view, points, registered.images)
     if start is None:
         return None
     chosen = evenly_spread(len(start.points), _MAX_INITIAL_MATCHES)
@@ -355,7 +357,7 @@ def _paired(
         if own.start is not None:
             # Tracks without a kept observation are gone, which changes the numbers of the others.
             is_kept = own.tracks.having(kept)
-            views = own.placed.frames[[own.start.first, own.start.second]]
+            views = own.registered.frames[[own.start.first, own.start.second]]
             first, second = np.searchsorted(frames, views).tolist()
             points = np.cumsum(is_kept)[own.start.points] - 1 + num_tracks
             starts.append(InitialPair(first, second, points))
@@ -405,7 +407,7 @@ def _warnings(
     if len(models) > 1:
         parts = ", ".join(
             f"{len(images)} from '{images[0].name}' to '{images[-1].name}'"
-            for images in (model.placed.images for model in models)
+            for images in (model.registered.images for model in models)
         )
         warnings.append(
             f"hardly any points connect {len(models)} parts of the images, which are matched "

@@ -72,8 +72,8 @@ def long_range_stage(
     """
 
     def make(_: Path) -> LongRangeResult:
-        placed = read_posed_images(run, posed, image_set)
-        far = _compared(run, tracks, image_set, dynamic_masks, placed)
+        registered = read_posed_images(run, posed, image_set)
+        far = _compared(run, tracks, image_set, dynamic_masks, registered)
         return LongRangeResult(
             median=far.median,
             largest=far.largest,
@@ -96,13 +96,13 @@ def _compared(
     tracks: Tracks,
     image_set: ImageSet,
     dynamic_masks: Mapping[str, Mask],
-    placed: PosedImages,
+    registered: PosedImages,
 ) -> LongRangeErrors:
     with run.clock.measure("long range"):
-        points_of = _points_by_image(run, tracks, placed)
-        check = LongRangeCheck(placed.images, placed.cameras, points_of.__getitem__)
-        masks = placed.masks_with(dynamic_masks)
-        places = np.searchsorted(image_set.images.frames, placed.frames[check.wanted]).tolist()
+        points_of = _points_by_image(run, tracks, registered)
+        check = LongRangeCheck(registered.images, registered.cameras, points_of.__getitem__)
+        masks = registered.masks_with(dynamic_masks)
+        places = np.searchsorted(image_set.images.frames, registered.frames[check.wanted]).tolist()
         index_of = dict(zip(places, check.wanted, strict=True))
         for done, (place, picture) in enumerate(run.pictures(image_set)(places), start=1):
             index = index_of[place]
@@ -111,10 +111,10 @@ def _compared(
         return check.result()
 
 
-def _points_by_image(run: Run, tracks: Tracks, placed: PosedImages) -> list[Floats]:
+def _points_by_image(run: Run, tracks: Tracks, registered: PosedImages) -> list[Floats]:
     """Float64 [n, 3] some points that each image observes."""
     some = tracks.every_nth(max(1, tracks.num_tracks // _NUM_TRACKS))
-    _, view, points = triangulate_in(run, placed, pose_tracks(run, some), FOR_POSES)
+    _, view, points = triangulate_in(run, registered, pose_tracks(run, some), FOR_POSES)
     xyz = np.repeat(points.xyz, np.diff(points.offsets), axis=0)
-    order, bounds = grouped(view[points.observation], len(placed.images))
+    order, bounds = grouped(view[points.observation], len(registered.images))
     return np.split(xyz[order], bounds[1:-1])

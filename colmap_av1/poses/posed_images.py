@@ -99,7 +99,7 @@ def posed_images_of(poses: PosedModel, image_set: ImageSet) -> PosedImages:
 
 
 def triangulate_in(
-    run: Run, placed: PosedImages, tracks: Tracks, options: TriangulateOptions
+    run: Run, registered: PosedImages, tracks: Tracks, options: TriangulateOptions
 ) -> tuple[Tracks, Ints, TriangulatedPoints]:
     """Triangulate tracks in the registered images.
 
@@ -107,11 +107,11 @@ def triangulate_in(
         The observations of the tracks in these images; int64 [num_observations] the index of the
         image of each; and the points, see `triangulate_tracks`.
     """
-    seen, view = seen_in(tracks, placed.frames)
+    seen, view = seen_in(tracks, registered.frames)
     points = triangulate_tracks(
         seen,
         view,
-        [PosedCamera(placed.cameras[i.camera_id], i.cam_from_world) for i in placed.images],
+        [PosedCamera(registered.cameras[i.camera_id], i.cam_from_world) for i in registered.images],
         options=options,
         num_threads=run.context.num_threads,
     )

@@ -129,8 +129,8 @@ def remap_stage(
         files = [f"{name}/0.npz"]
         (partial / name).mkdir()
         write_posed_model(partial / files[0], PosedModel(poses.cameras, poses.images))
-        placed = poses.by_name
-        left = [image for image in known.images if image.name not in placed]
+        by_name = poses.by_name
+        left = [image for image in known.images if image.name not in by_name]
         if left:
             files.append(f"{name}/1.npz")
             write_posed_model(partial / files[1], PosedModel(known.cameras, left))
@@ -222,13 +222,13 @@ def _costs(
         The share of the observations in images of `found` that agree with it, and their mean robust
         costs with `known` and with `found`, after adjustment.
     """
-    placed = posed_images_of(found, image_set)
-    in_both = np.isin(tracks.frame, placed.frames)
-    seen, view, agreeing = triangulate_in(run, placed, tracks, FROM_PICTURES)
+    registered = posed_images_of(found, image_set)
+    in_both = np.isin(tracks.frame, registered.frames)
+    seen, view, agreeing = triangulate_in(run, registered, tracks, FROM_PICTURES)
     if len(agreeing.xyz) == 0:
         return 0.0, 0.0, 0.0
     points = to_model_points(agreeing, view, seen)
-    adjusted = adjust_posed(run, PosedModel(placed.cameras, placed.images, points)).model
+    adjusted = adjust_posed(run, PosedModel(registered.cameras, registered.images, points)).model
     known_errors = reprojection_errors(known)[in_both][agreeing.observation]
     return (
         len(agreeing.observation) / len(view),

@@ -41,17 +41,17 @@ def resection_stage(
     def make(partial: Path) -> PosesResult:
         known = read_posed_images(run, posed, keyed)
         with run.clock.measure("resection"):
-            placed = _resect(run, tracks, image_set, known)
-        model = PosedModel(known.cameras, placed)
-        write_posed_model(partial / "placed.npz", model)
-        return PosesResult("placed.npz", len(placed))
+            images = _resect(run, tracks, image_set, known)
+        model = PosedModel(known.cameras, images)
+        write_posed_model(partial / "resected.npz", model)
+        return PosesResult("resected.npz", len(images))
 
     return run_stage(
         run.stages,
         "resection",
         [posed.digest, image_set.images.names, run.context.seed],
         PosesResult,
-        products=["placed.npz"],
+        products=["resected.npz"],
         make=make,
     )
 

@@ -54,20 +54,20 @@ _MASKS = "masks"
 
 
 def _tracked_points(
-    run: Run, placed: PosedImages, views: Sequence[PosedCamera], tracks: Tracks
+    run: Run, registered: PosedImages, views: Sequence[PosedCamera], tracks: Tracks
 ) -> tuple[ModelPoints, float]:
     """Points of all tracks, in black, with observations in pixels of the written images.
 
     Returns:
         The points, and the share of the tracks that agree with the poses.
     """
-    seen, view = seen_in(tracks, placed.frames)
-    rays = rays_of(seen, view, placed.camera_of_image)
+    seen, view = seen_in(tracks, registered.frames)
+    rays = rays_of(seen, view, registered.camera_of_image)
     cameras = [own.camera for own in views]
     points = triangulate_tracks(
         seen,
         view,
-        [PosedCamera(placed.cameras[i.camera_id], i.cam_from_world) for i in placed.images],
+        [PosedCamera(registered.cameras[i.camera_id], i.cam_from_world) for i in registered.images],
         options=run.options.triangulate,
         num_threads=run.context.num_threads,
         pinholes=cameras,
@@ -88,19 +88,19 @@ def _tracked_points(
 _Undistort = Callable[[int], Undistortion | None]
 
 
-def _undistortions(placed: PosedImages, cameras: Mapping[int, pycolmap.Camera]) -> _Undistort:
+def _undistortions(registered: PosedImages, cameras: Mapping[int, pycolmap.Camera]) -> _Undistort:
     """The undistortion of each image; `cameras` are those of the written images, by id."""
 
     # Consecutive images share a camera, and the maps of many cameras would need much memory.
     @functools.lru_cache(maxsize=1)
     def of_camera(camera_id: int) -> Undistortion | None:
-        return undistortion(placed.cameras[camera_id], cameras[camera_id])
+        return undistortion(registered.cameras[camera_id], cameras[camera_id])
 
     one_at_a_time = threading.Lock()  # else each thread would create the same map
 
     def of_image(index: int) -> Undistortion | None:
         with one_at_a_time:
-            return of_camera(placed.images[index].camera_id)
+            return of_camera(registered.images[index].camera_id)
 
     return of_image
 
@@ -112,14 +112,14 @@ def _undistorted(picture: Picture, how: Undistortion | None) -> Picture:
 def _written_images(
     run: Run,
     folder: Path,
-    placed: PosedImages,
+    registered: PosedImages,
     undistort: _Undistort,
     look: Look,
 ) -> None:
     """Write the images, and call `look` with those of videos."""
     options, progress = run.options, run.progress
-    index_of_frame = {int(frame): i for i, frame in enumerate(placed.frames)}
-    names = [image.name for image in placed.images]
+    index_of_frame = {int(frame): i for i, frame in enumerate(registered.frames)}
+    names = [image.name for image in registered.images]
 
     def change(first: int, frame: int, picture: Picture) -> Picture:
         return _undistorted(picture, undistort(index_of_frame[first + frame]))
@@ -132,15 +132,15 @@ def _written_images(
     def report(count: int) -> None:
         progress("images", done + count, len(names))
 
-    for sequence in np.unique(placed.sequence).tolist():
-        own = np.flatnonzero(placed.sequence == sequence)
-        first = int(placed.first_frame[sequence])
+    for sequence in np.unique(registered.sequence).tolist():
+        own = np.flatnonzero(registered.sequence == sequence)
+        first = int(registered.first_frame[sequence])
         if sequence < len(run.sources):
             write_images(
                 run.sources[sequence].pictures,
                 folder,
                 [names[i] for i in own],
-                (placed.frames[own] - first).tolist(),
+                (registered.frames[own] - first).tolist(),
                 num_threads=run.context.num_threads,
                 operating_point=options.match.read.operating_point,
                 change=functools.partial(change, first),
@@ -160,7 +160,7 @@ def _written_images(
 def _written_cloud(
     run: Run,
     folder: Path,
-    placed: PosedImages,
+    registered: PosedImages,
     views: Sequence[PosedCamera],
     tracked: ModelPoints,
     *,
@@ -171,7 +171,7 @@ def _written_cloud(
 
     def show(look: Look) -> None:
         with clock.measure("images"):
-            _written_images(run, folder, placed, undistort, look)
+            _written_images(run, folder, registered, undistort, look)
 
     if options.points == "survey":
         show(lambda *_: None)
@@ -179,7 +179,7 @@ def _written_cloud(
     return swept_cloud(
         tracked,
         views,
-        placed.sequence,
+        registered.sequence,
         show,
         max_points=options.max_points,
         num_threads=run.context.num_threads,
@@ -190,7 +190,7 @@ def _written_cloud(
 def _coloured(
     run: Run,
     image_set: ImageSet,
-    placed: PosedImages,
+    registered: PosedImages,
     views: Sequence[PosedCamera],
     cloud: ModelPoints,
     *,
@@ -201,7 +201,7 @@ def _coloured(
     Reading the written images instead would take several times as long.
     """
     colours = Colours(cloud, [view.size for view in views])
-    places = np.searchsorted(image_set.images.frames, placed.frames).tolist()
+    places = np.searchsorted(image_set.images.frames, registered.frames).tolist()
     index_of = {place: index for index, place in enumerate(places)}
     with run.clock.measure("colours"):
         for done, (place, picture) in enumerate(run.pictures(image_set)(places), start=1):
@@ -274,23 +274,25 @@ def model_stage(
     masked = run.inputs.masks is not None or options.moving == "mask"
 
     def make(partial: Path) -> ModelResult:
-        placed = read_posed_images(run, posed, image_set)
-        cameras = output_cameras(placed.cameras, undistort=options.undistort)
-        images = placed.images
-        given = undistorted_masks(placed.masks, placed.camera_of_image, cameras)
-        joined = placed.masks_with(dynamic_masks)
-        valid = undistorted_masks(joined, placed.camera_of_image, cameras)
+        registered = read_posed_images(run, posed, image_set)
+        cameras = output_cameras(registered.cameras, undistort=options.undistort)
+        images = registered.images
+        given = undistorted_masks(registered.masks, registered.camera_of_image, cameras)
+        joined = registered.masks_with(dynamic_masks)
+        valid = undistorted_masks(joined, registered.camera_of_image, cameras)
         views = views_of(images, cameras, valid)
         with clock.measure("points"):
-            tracked, agreeing = _tracked_points(run, placed, views, tracks)
+            tracked, agreeing = _tracked_points(run, registered, views, tracks)
             shows_dynamic = np.array([image.name in dynamic_masks for image in images])
             tracked = tracked.take(static_points(tracked, shows_dynamic))
-        undistort = _undistortions(placed, cameras)
-        cloud = _written_cloud(run, partial / "images", placed, views, tracked, undistort=undistort)
+        undistort = _undistortions(registered, cameras)
+        cloud = _written_cloud(
+            run, partial / "images", registered, views, tracked, undistort=undistort
+        )
         check_unchanged(*run.files)
         with clock.measure("coverage"):
             covered = coverage(views, cloud.xyz)
-        cloud = _coloured(run, image_set, placed, views, cloud, undistort=undistort)
+        cloud = _coloured(run, image_set, registered, views, cloud, undistort=undistort)
         with clock.measure("writing"):
             folder = partial / "sparse" / "0"
             folder.mkdir(parents=True)
@@ -306,7 +308,8 @@ def model_stage(
             coverage=covered,
             mean_error=mean_error(cloud),
             focal_lengths=(min(focal), max(focal)),
-            undistorted=options.undistort and not all(map(is_undistorted, placed.cameras.values())),
+            undistorted=options.undistort
+            and not all(map(is_undistorted, registered.cameras.values())),
             agreeing=agreeing,
         )
 

@@ -92,8 +92,8 @@ def further_models(
             positions=run.positions.some(index),
         )
         model = written_model(placing, own.posed, own.image_set)[1].result
-        placed = read_posed_images(own.run, own.posed.last, own.image_set)
-        names = [image.name for image in placed.images]
+        images = read_posed_images(own.run, own.posed.last, own.image_set).images
+        names = [image.name for image in images]
         registered.update(names)
         found.append(
             FurtherModel(

@@ -61,23 +61,23 @@ def scene() -> tuple[PosedImages, Tracks]:
         confirmed=np.ones(total, np.bool_),
     )
     first = np.array([0, NUM_IMAGES])
-    placed = PosedImages(
+    registered = PosedImages(
         images, frames, np.zeros(NUM_IMAGES, np.int32), first, {1: camera}, (None,) * NUM_IMAGES
     )
-    return placed, tracks
+    return registered, tracks
 
 
 RUN = cast(Any, SimpleNamespace(options=ReconstructOptions(), context=RunContext()))
 
 
 def test_wrong_pose_is_corrected_from_corners() -> None:
-    placed, corners = scene()
-    true = placed.images[WRONG].cam_from_world
+    registered, corners = scene()
+    true = registered.images[WRONG].cam_from_world
     turned = Rotation.from_euler("xyz", [0.4, 0.7, 0.2], degrees=True).as_matrix() @ true
-    images = list(placed.images)
+    images = list(registered.images)
     images[WRONG] = replace(images[WRONG], cam_from_world=turned)
-    found = resect_from_corners(RUN, corners, replace(placed, images=images))
-    for image, right in zip(found.images, placed.images, strict=True):
+    found = resect_from_corners(RUN, corners, replace(registered, images=images))
+    for image, right in zip(found.images, registered.images, strict=True):
         # Rotation error in pixels.
         off = np.abs(image.cam_from_world[:, :3] - right.cam_from_world[:, :3]).max() * FOCAL
         assert off < 0.3, image.name
@@ -85,7 +85,7 @@ def test_wrong_pose_is_corrected_from_corners() -> None:
 
 
 def test_poses_are_unchanged_without_corners() -> None:
-    placed, corners = scene()
+    registered, corners = scene()
     none = replace(
         corners,
         offsets=corners.offsets[:1],
@@ -94,15 +94,15 @@ def test_poses_are_unchanged_without_corners() -> None:
         sigma=corners.sigma[:0],
         confirmed=corners.confirmed[:0],
     )
-    assert resect_from_corners(RUN, none, placed) is placed
+    assert resect_from_corners(RUN, none, registered) is registered
 
 
 def test_links_join_images_across_a_gap_in_the_tracks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    placed, seen = scene()
+    registered, seen = scene()
     joint = 4  # the image before it
-    after = placed.frames > joint
+    after = registered.frames > joint
     # All images after the joint are shifted by about 6 px, more than the error of motion tracks.
     off = np.column_stack([np.eye(3), [0, 0.07, 0]])
     images = [
@@ -111,14 +111,14 @@ def test_links_join_images_across_a_gap_in_the_tracks(
         else i
         for i, is_after, moved in (
             (i, is_after, i.cam_from_world[:, :3] @ off[:, 3] + i.cam_from_world[:, 3])
-            for i, is_after in zip(placed.images, after, strict=True)
+            for i, is_after in zip(registered.images, after, strict=True)
         )
     ]
     number = np.repeat(np.arange(NUM_POINTS), NUM_IMAGES)
     later = seen.frame > joint
     tracks = seen.keep_observations(((number % 2 == 0) & ~later) | ((number % 4 == 1) & later))
     links = seen.keep_observations((number % 4 == 3) & (np.abs(seen.frame - joint) <= 3))
-    write_posed_model(tmp_path / "placed.npz", PosedModel(placed.cameras, images))
+    write_posed_model(tmp_path / "registered.npz", PosedModel(registered.cameras, images))
     options = ReconstructOptions(mapping=MapperOptions(refine_intrinsics=False))
     run = SimpleNamespace(
         options=options,
@@ -130,10 +130,10 @@ def test_links_join_images_across_a_gap_in_the_tracks(
     )
     image_set = ImageSet(
         ("",),
-        ChosenImages([image.name for image in images], placed.frames),
-        placed.sequence,
-        placed.first_frame,
-        placed.masks,
+        ChosenImages([image.name for image in images], registered.frames),
+        registered.sequence,
+        registered.first_frame,
+        registered.masks,
     )
     monkeypatch.setattr(
         "colmap_av1.poses.adjustment_stage.corners_in_images",
@@ -144,13 +144,13 @@ def test_links_join_images_across_a_gap_in_the_tracks(
         tracks,
         links,
         image_set,
-        Kept(PosesResult("placed.npz", NUM_IMAGES), "", resumed=False),
+        Kept(PosesResult("registered.npz", NUM_IMAGES), "", resumed=False),
         dynamic_masks={},
         masks_digest=None,
         has_picture_positions=True,
     )
     found = read_posed_model(tmp_path / adjusted.result.poses).by_name
-    centres = camera_centres(np.array([found[i.name].cam_from_world for i in placed.images]))
+    centres = camera_centres(np.array([found[i.name].cam_from_world for i in registered.images]))
     steps = np.diff(centres, axis=0)
     usual = np.median(steps, axis=0)
     assert np.linalg.norm(steps[joint] - usual) < 0.05 * np.linalg.norm(usual)

@@ -40,7 +40,7 @@ from colmap_av1.options import (
     ReconstructOptions,
     TriangulateOptions,
 )
-from colmap_av1.poses.dynamic.contradictions import Contradictions, PlacedTracks, place_tracks
+from colmap_av1.poses.dynamic.contradictions import Contradictions, TracksInCells, tracks_in_cells
 from colmap_av1.poses.dynamic.following import expect_in_views, follow_behind
 from colmap_av1.poses.dynamic.regions import dynamic_cells, shares_above_usual, strong_patches
 from colmap_av1.poses.dynamic.short_tracks import static_points
@@ -65,7 +65,7 @@ WALL, BOX = 6.0, 4.0
 
 @dataclass(frozen=True)
 class Made:
-    placed: PlacedTracks
+    tracks: TracksInCells
     views: list[PosedCamera]
     moves: NDArray[np.bool_]
 
@@ -142,8 +142,8 @@ def made(velocity: tuple[float, float, float] | None, *, drift: float = 0.0) -> 
             max_reprojection_error=8.0, min_angle=0.0, max_depth_error=None, points="survey"
         ),
     )
-    placed = place_tracks(tracks, image, points, views, cell=CELL)
-    return Made(placed, views, np.array(moves))
+    in_cells = tracks_in_cells(tracks, image, points, views, cell=CELL)
+    return Made(in_cells, views, np.array(moves))
 
 
 def test_points_fall_into_the_right_cells_of_very_wide_images() -> None:
@@ -157,11 +157,11 @@ def test_points_fall_into_the_right_cells_of_very_wide_images() -> None:
     length = 6
     track = np.repeat(np.arange(5), length)
     column = (x // cell).astype(np.int64)[track]
-    placed = PlacedTracks(
+    tracks = TracksInCells(
         *((2, 4, width // cell), cell, np.arange(0, 31, length), track, first[track]),
         *(0 * column + 2, column, one[track], 0 * one, xyz),
     )
-    unseen = Contradictions(placed, views).unseen(np.zeros(5, np.bool_))
+    unseen = Contradictions(tracks, views).unseen(np.zeros(5, np.bool_))
     assert not unseen[0].any()
     assert np.argwhere(unseen[1]).tolist() == [[2, k] for k in columns]
 
@@ -173,13 +173,13 @@ WALKS = [(-0.05, 0, 0), (0.13, 0, 0), (-0.01, 0, -0.06), (0, -0.03, 0)]
 @pytest.mark.parametrize("velocity", WALKS)
 def test_walker_is_found_in_any_direction(velocity: tuple[float, float, float]) -> None:
     scene = made(velocity)
-    found = Contradictions(scene.placed, scene.views)
+    found = Contradictions(scene.tracks, scene.views)
     by_depth = found.by_depth(np.zeros(len(scene.moves), np.bool_))
     assert np.mean(by_depth[scene.moves]) > 0.2
     assert np.mean(by_depth[~scene.moves]) < 0.01
-    cells = dynamic_cells(scene.placed, scene.views)
-    placed = scene.placed
-    within = placed.mean(cells[placed.image, placed.row, placed.column])
+    cells = dynamic_cells(scene.tracks, scene.views)
+    tracks = scene.tracks
+    within = tracks.mean(cells[tracks.image, tracks.row, tracks.column])
     assert np.mean(within[scene.moves] > 0.5) > 0.9
     # Dynamic regions are dilated by a cell, so some static tracks next to them are included.
     assert np.mean(within[~scene.moves] > 0.5) < 0.12
@@ -187,30 +187,30 @@ def test_walker_is_found_in_any_direction(velocity: tuple[float, float, float]) 
 
 def test_projections_that_are_not_kept_are_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = made(WALKS[0])
-    cells = dynamic_cells(scene.placed, scene.views)
+    cells = dynamic_cells(scene.tracks, scene.views)
     monkeypatch.setattr("colmap_av1.poses.dynamic.contradictions._MAX_KEPT", 0)
     assert cells.any()
-    assert (dynamic_cells(scene.placed, scene.views) == cells).all()
+    assert (dynamic_cells(scene.tracks, scene.views) == cells).all()
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.3])
 def test_static_scene_has_no_dynamic_cells(drift: float) -> None:
     """Occlusion by the box and drifting tracks on smooth surfaces do not count as motion."""
     scene = made(None, drift=drift)
-    assert not dynamic_cells(scene.placed, scene.views).any()
+    assert not dynamic_cells(scene.tracks, scene.views).any()
 
 
 def test_usual_share_is_computed_from_static_cells() -> None:
     """Where most of the scene moves, only the static rest gives the baseline."""
-    placed = made(None).placed
-    _, _, columns = placed.shape
-    moving = np.zeros(placed.shape, np.bool_)
+    tracks = made(None).tracks
+    _, _, columns = tracks.shape
+    moving = np.zeros(tracks.shape, np.bool_)
     moving[:, :, : 2 * columns // 3] = True
-    within = placed.mean(moving[placed.image, placed.row, placed.column])
+    within = tracks.mean(moving[tracks.image, tracks.row, tracks.column])
     share_of_track = np.where(within > 0.5, 1.0, 0.3)
     inside = (slice(None), slice(4, -4), slice(2 * columns // 3 + 6, -4))
     for still, expected in ((~moving, 0.0), (np.ones_like(moving), -0.7)):
-        share = shares_above_usual(placed, share_of_track, still)[inside]
+        share = shares_above_usual(tracks, share_of_track, still)[inside]
         assert np.median(share) == pytest.approx(expected, abs=0.05)
 
 
@@ -325,14 +325,14 @@ class Passed:
         run: the run after the preceding stages.
         moving: masks of the band, by image name.
         tracks: tracks of the scene, cut at the band.
-        placed: the posed images.
+        registered: the posed images.
         left: the first column of the band in each image.
     """
 
     run: Run
     moving: dict[str, Mask]
     tracks: Tracks
-    placed: PosedImages
+    registered: PosedImages
     left: NDArray[np.int64]
 
 
@@ -348,7 +348,7 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
         make_mask(np.tile((column < at) | (column >= at + 100), (360, 1))) for at in left.tolist()
     ]
     names = [f"{frame}.png" for frame in frames]
-    placed = PosedImages(
+    registered = PosedImages(
         images=[
             ModelImage(frame + 1, name, 7, truth.cam_from_world[frame])
             for frame, name in enumerate(names)
@@ -374,7 +374,7 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
     some = DensityOptions(max_tracks_per_image=400, spacing=20.0, min_images=3, max_sigma=0.0)
     cut = mask_tracks(every.keep_frames(frames), dict(enumerate(masks)), 4)
     moving = dict(zip(names, masks, strict=True))
-    return Passed(run, moving, select_tracks(cut, some), placed, left)
+    return Passed(run, moving, select_tracks(cut, some), registered, left)
 
 
 def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -392,7 +392,7 @@ def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
 
 
 def test_tracks_continue_behind_a_passing_object(passed: Passed) -> None:
-    found = follow_behind(passed.run, passed.moving, passed.tracks, passed.placed)
+    found = follow_behind(passed.run, passed.moving, passed.tracks, passed.registered)
     assert found.num_observations > 1.1 * passed.tracks.num_observations
     assert len(off_behind(passed.tracks)[0]) < 10
     taken_up, off = off_behind(found)
@@ -406,10 +406,10 @@ def test_tracks_continue_behind_a_passing_object(passed: Passed) -> None:
 
 def test_camera_that_stands_still_gives_no_tracks(passed: Passed) -> None:
     """The pictures of another video may show parallax."""
-    pose = passed.placed.images[0].cam_from_world
-    still = [replace(image, cam_from_world=pose) for image in passed.placed.images]
-    placed = replace(passed.placed, images=still)
-    assert follow_behind(passed.run, passed.moving, passed.tracks, placed).num_tracks == 0
+    pose = passed.registered.images[0].cam_from_world
+    still = [replace(image, cam_from_world=pose) for image in passed.registered.images]
+    registered = replace(passed.registered, images=still)
+    assert follow_behind(passed.run, passed.moving, passed.tracks, registered).num_tracks == 0
 
 
 @pytest.mark.parametrize("pixels", [1, 7])
@@ -418,10 +418,12 @@ def test_wrong_poses_do_not_continue_tracks_wrongly(passed: Passed, pixels: floa
     turn = Rotation.from_euler("y", pixels / 520).as_matrix()
     images = [
         replace(image, cam_from_world=turn @ image.cam_from_world) if frame >= 20 else image
-        for frame, image in enumerate(passed.placed.images)
+        for frame, image in enumerate(passed.registered.images)
     ]
     early = passed.tracks.keep_frames(np.arange(20, dtype=np.int32))
-    found = follow_behind(passed.run, passed.moving, early, replace(passed.placed, images=images))
+    found = follow_behind(
+        passed.run, passed.moving, early, replace(passed.registered, images=images)
+    )
     first = np.repeat(found.offsets[:-1], found.lengths)
     late = np.flatnonzero(found.frame >= 20)
     if pixels > 1:  # outside the search window

@@ -32,7 +32,7 @@ _MAX_ERROR = 8.0
 
 
 def corners_in_images(
-    run: Run, dynamic_masks: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
+    run: Run, dynamic_masks: Mapping[str, Mask], tracks: Tracks, registered: PosedImages
 ) -> tuple[Tracks, PosedImages]:
     """Find corners in the images of all videos, and correct poses that contradict them.
 
@@ -40,35 +40,35 @@ def corners_in_images(
         run: inputs and options of the run.
         dynamic_masks: masks that exclude dynamic pixels, by image name.
         tracks: tracks of static points, which guide the search.
-        placed: the registered images.
+        registered: the registered images.
 
     Returns:
         The corners as tracks, and the images with the corrected poses.
     """
-    masks = placed.masks_with(dynamic_masks)
+    masks = registered.masks_with(dynamic_masks)
     with GreyPictures(run.stages) as pictures:
-        followed = _followed(run, masks, tracks, placed, pictures)
-        placed = resect_from_corners(run, followed, placed)
-        return _match_in_all(run, masks, followed, placed, pictures), placed
+        followed = _followed(run, masks, tracks, registered, pictures)
+        registered = resect_from_corners(run, followed, registered)
+        return _match_in_all(run, masks, followed, registered, pictures), registered
 
 
 def _followed(
     run: Run,
     masks: list[Mask | None],
     tracks: Tracks,
-    placed: PosedImages,
+    registered: PosedImages,
     pictures: GreyPictures,
 ) -> Tracks:
     """Follow corners through the images of each video, and store the pictures."""
-    image_of = {int(frame): i for i, frame in enumerate(placed.frames)}
+    image_of = {int(frame): i for i, frame in enumerate(registered.frames)}
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.shown)):
-        own = np.flatnonzero(placed.sequence == video)
+        own = np.flatnonzero(registered.sequence == video)
         if len(own) == 0:
             continue
-        first = int(placed.first_frame[video])
-        mask_of = {int(placed.frames[i]) - first: masks[i] for i in own}
-        guide = tracks.keep_observations(np.isin(tracks.frame, placed.frames[own]))
+        first = int(registered.first_frame[video])
+        mask_of = {int(registered.frames[i]) - first: masks[i] for i in own}
+        guide = tracks.keep_observations(np.isin(tracks.frame, registered.frames[own]))
         num_frames = max(mask_of) + 1
         guide = replace(guide, frame=guide.frame - np.int32(first), num_frames=num_frames)
         decoded = run.shown[video].pictures(
@@ -91,26 +91,26 @@ def _match_in_all(
     run: Run,
     masks: list[Mask | None],
     corners: Tracks,
-    placed: PosedImages,
+    registered: PosedImages,
     pictures: GreyPictures,
 ) -> Tracks:
     """Locate corners in all images that see them, see `match_patches`."""
-    seen, view, points = triangulate_in(run, placed, corners, FROM_PICTURES)
-    views = views_of(placed.images, placed.cameras, masks)
+    seen, view, points = triangulate_in(run, registered, corners, FROM_PICTURES)
+    views = views_of(registered.images, registered.cameras, masks)
     report = progress_in(run.progress, "refinement", len(views))
     return match_patches(
         seen,
         view,
         points,
         views=views,
-        frames=placed.frames,
+        frames=registered.frames,
         pictures=pictures,
         num_threads=run.context.num_threads,
         progress=report,
     )
 
 
-def resect_from_corners(run: Run, corners: Tracks, placed: PosedImages) -> PosedImages:
+def resect_from_corners(run: Run, corners: Tracks, registered: PosedImages) -> PosedImages:
     """Resect images from the points of corners, and keep the poses that fit these better.
 
     Where many motion vectors share an error, an image gets a wrong pose that agrees with them. An
@@ -119,14 +119,14 @@ def resect_from_corners(run: Run, corners: Tracks, placed: PosedImages) -> Posed
     Args:
         run: inputs and options of the run.
         corners: corners as tracks.
-        placed: the registered images.
+        registered: the registered images.
     """
-    seen, _, points = triangulate_in(run, placed, corners, FROM_PICTURES)
+    seen, _, points = triangulate_in(run, registered, corners, FROM_PICTURES)
     if len(points.xyz) == 0:
-        return placed
-    images = list(placed.images)
-    cameras = placed.camera_of_image
-    sightings = sightings_of(points, seen, seen, placed.frames, cameras)
+        return registered
+    images = list(registered.images)
+    cameras = registered.camera_of_image
+    sightings = sightings_of(points, seen, seen, registered.frames, cameras)
     focal = np.array([camera.mean_focal_length() for camera in cameras])
     found = resect(
         sightings,
@@ -141,7 +141,7 @@ def resect_from_corners(run: Run, corners: Tracks, placed: PosedImages) -> Posed
         shown = sightings.rays[own] * focal[i], sightings.xyz[own], float(focal[i])
         if pose is not None and _error(*shown, pose) < _error(*shown, images[i].cam_from_world):
             images[i] = replace(images[i], cam_from_world=pose)
-    return replace(placed, images=images)
+    return replace(registered, images=images)
 
 
 def _error(

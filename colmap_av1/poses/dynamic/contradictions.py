@@ -57,7 +57,7 @@ _MAX_KEPT = 40_000_000
 
 
 @dataclass(frozen=True)
-class PlacedTracks:
+class TracksInCells:
     """Tracks with their points, and the grid cells of their observations.
 
     Attributes:
@@ -105,14 +105,14 @@ class PlacedTracks:
         return np.asarray(found.reshape(self.shape), dtype=np.float64)
 
 
-def place_tracks(
+def tracks_in_cells(
     tracks: Tracks,
     image: Ints,
     points: TriangulatedPoints,
     views: Sequence[PosedCamera],
     *,
     cell: int,
-) -> PlacedTracks:
+) -> TracksInCells:
     """Compute the residuals, depths and cells of tracks.
 
     Args:
@@ -144,7 +144,7 @@ def place_tracks(
     columns, rows = (-(-length // cell) for length in views[0].size)
     column, row = (tracks.xy // cell).astype(np.int64).T
     squared = np.add.reduceat(ratio**2, offsets[:-1]) / np.diff(offsets)
-    return PlacedTracks(
+    return TracksInCells(
         shape=(len(views), rows, columns),
         cell=cell,
         offsets=offsets,
@@ -172,23 +172,23 @@ class Contradictions:
     """Finds the tracks that contradict the poses.
 
     Args:
-        placed: the tracks.
+        tracks: the tracks.
         views: the images.
         num_threads: number of threads; None: one per CPU. The result does not depend on it.
     """
 
     def __init__(
         self,
-        placed: PlacedTracks,
+        tracks: TracksInCells,
         views: Sequence[PosedCamera],
         *,
         num_threads: int | None = None,
     ) -> None:
-        self._placed, self._num_threads = placed, num_threads
-        by_image, bounds = grouped(placed.image, len(views))
+        self._tracks, self._num_threads = tracks, num_threads
+        by_image, bounds = grouped(tracks.image, len(views))
         self._seen = [by_image[a:b] for a, b in itertools.pairwise(bounds)]
         self._views = views
-        self._there = np.flatnonzero(np.isfinite(placed.xyz[:, 0]))
+        self._there = np.flatnonzero(np.isfinite(tracks.xyz[:, 0]))
         self._kept: list[_Shown] | None = None
         if len(views) * len(self._there) <= _MAX_KEPT:
             self._kept = list(map_on_threads(self._show, range(len(views)), num_threads))
@@ -196,14 +196,14 @@ class Contradictions:
     @property
     def by_motion(self) -> Bools:
         """Bool [num_tracks] tracks that fit no single point over their whole length."""
-        return np.asarray(self._placed.residual > _CONTRADICTS)
+        return np.asarray(self._tracks.residual > _CONTRADICTS)
 
     @property
     def surely_by_motion(self) -> Bools:
         """Bool [num_tracks] long tracks with large residuals; drifting tracks are seldom long."""
-        placed = self._placed
+        tracks = self._tracks
         return np.asarray(
-            (placed.residual > _SURELY_CONTRADICTS) & (placed.lengths >= _SURE_LENGTH)
+            (tracks.residual > _SURELY_CONTRADICTS) & (tracks.lengths >= _SURE_LENGTH)
         )
 
     def by_depth(self, dynamic: Bools) -> Bools:
@@ -225,8 +225,8 @@ class Contradictions:
         Returns:
             float64 [images, rows, columns].
         """
-        agreeing = self._agreeing & ~left_out & (self._placed.lengths >= _LONG)
-        found = np.zeros(self._placed.shape)
+        agreeing = self._agreeing & ~left_out & (self._tracks.lengths >= _LONG)
+        found = np.zeros(self._tracks.shape)
         images = map_on_threads(self._shown, range(len(found)), self._num_threads)
         for own, shown in zip(found, images, strict=True):
             kept = agreeing[shown.track]
@@ -235,38 +235,38 @@ class Contradictions:
 
     @property
     def _agreeing(self) -> Bools:
-        placed = self._placed
-        return np.asarray((placed.residual < _AGREES) & np.isfinite(placed.xyz[:, 0]))
+        tracks = self._tracks
+        return np.asarray((tracks.residual < _AGREES) & np.isfinite(tracks.xyz[:, 0]))
 
     def _shown(self, image: int) -> _Shown:
         return self._kept[image] if self._kept is not None else self._show(image)
 
     def _show(self, image: int) -> _Shown:
-        placed = self._placed
-        index, xy, depth = self._views[image].project(placed.xyz[self._there])
+        tracks = self._tracks
+        index, xy, depth = self._views[image].project(tracks.xyz[self._there])
         track = self._there[index]
-        is_seen = np.zeros(len(placed.xyz), np.bool_)
-        is_seen[placed.track[self._seen[image]]] = True
+        is_seen = np.zeros(len(tracks.xyz), np.bool_)
+        is_seen[tracks.track[self._seen[image]]] = True
         unseen = np.flatnonzero(~is_seen[track])
         # NumPy divides integers many times faster. Positions are at most 65,536.
-        cell = (xy[unseen].astype(np.int32) // np.int32(placed.cell)).astype(np.int16)
+        cell = (xy[unseen].astype(np.int32) // np.int32(tracks.cell)).astype(np.int16)
         own = track[unseen].astype(np.int32)
         return _Shown(own, cell[:, 1], cell[:, 0], depth[unseen].astype(np.float32))
 
     def _hiding(self, agreeing: Bools) -> Bools:
         from scipy.ndimage import minimum_filter, uniform_filter  # noqa: PLC0415 - slow to import
 
-        placed = self._placed
-        _, rows, columns = placed.shape
+        tracks = self._tracks
+        _, rows, columns = tracks.shape
         hides, looked = np.zeros(len(agreeing)), np.zeros(len(agreeing))
 
         def hiding_in(image: int) -> tuple[NDArray[np.int32], Bools]:
             """The tracks with enough points around them, and whether each would hide those."""
             seen, shown = self._seen[image], self._shown(image)
-            own = seen[agreeing[placed.track[seen]]]
-            at = placed.row[own] * columns + placed.column[own]
+            own = seen[agreeing[tracks.track[seen]]]
+            at = tracks.row[own] * columns + tracks.column[own]
             in_cells = np.full(rows * columns, np.inf)
-            np.minimum.at(in_cells, at, placed.depth[own])
+            np.minimum.at(in_cells, at, tracks.depth[own])
             nearest = minimum_filter(in_cells.reshape(rows, columns), _AROUND, mode="nearest")
             counts = np.bincount(at, minlength=rows * columns).astype(np.float64)
             count = uniform_filter(counts.reshape(rows, columns), _AROUND, mode="constant")
@@ -283,8 +283,8 @@ class Contradictions:
         return (hides > _HIDDEN_SHARE * looked) & (looked >= _MIN_IMAGES)
 
     def _seen_through(self, agreeing: Bools) -> Bools:
-        placed = self._placed
-        known = placed.depth[np.isfinite(placed.depth)]
+        tracks = self._tracks
+        known = tracks.depth[np.isfinite(tracks.depth)]
         nearest = float(np.quantile(known, 0.001)) if len(known) else 1.0
 
         def steps(depth: NDArray[np.floating]) -> Ints:
@@ -297,24 +297,24 @@ class Contradictions:
         def through_in(image: int) -> tuple[Ints, Bools]:
             """The tracks with points, and whether they are seen through a surface."""
             rows, shown = self._seen[image], self._shown(image)
-            own = rows[np.isfinite(placed.depth[rows])]
+            own = rows[np.isfinite(tracks.depth[rows])]
             kept = agreeing[shown.track]
-            proof = own[agreeing[placed.track[own]]]
-            step = steps(placed.depth[own]) - _STEPS_BEFORE
-            at = placed.row[own], placed.column[own], np.maximum(step, 0)
+            proof = own[agreeing[tracks.track[own]]]
+            step = steps(tracks.depth[own]) - _STEPS_BEFORE
+            at = tracks.row[own], tracks.column[own], np.maximum(step, 0)
             there = self._at_most(shown.row[kept], shown.column[kept], steps(shown.depth[kept]), at)
             seen = self._at_most(
-                placed.row[proof], placed.column[proof], steps(placed.depth[proof]), at
+                tracks.row[proof], tracks.column[proof], steps(tracks.depth[proof]), at
             )
             is_through = (there >= _MIN_BEFORE) & (seen == 0) & (step >= 0)
-            return placed.track[own], np.asarray(is_through)
+            return tracks.track[own], np.asarray(is_through)
 
         for track, is_through in map_on_threads(
             through_in, range(len(self._seen)), self._num_threads
         ):
             # `+=` suffices: a track has one observation per image.
             through[track] += is_through
-        return np.asarray(through > _THROUGH_SHARE * placed.lengths)
+        return np.asarray(through > _THROUGH_SHARE * tracks.lengths)
 
     def _at_most(
         self,
@@ -333,7 +333,7 @@ class Contradictions:
         """
         # A border of empty cells completes the neighbourhoods of the outer ones.
         edge = _AROUND // 2
-        _, rows, columns = self._placed.shape
+        _, rows, columns = self._tracks.shape
         stride, size = columns + 2 * edge, (rows + 2 * edge) * (columns + 2 * edge)
         cell = (row.astype(np.int64) + edge) * stride + column + edge
         count = np.bincount(step * size + cell, minlength=size * _NUM_STEPS)

@@ -43,7 +43,7 @@ def has_changing_masks(image_set: ImageSet) -> bool:
 
 
 def follow_behind(
-    run: Run, dynamic_masks: Mapping[str, Mask], tracks: Tracks, placed: PosedImages
+    run: Run, dynamic_masks: Mapping[str, Mask], tracks: Tracks, registered: PosedImages
 ) -> Tracks:
     """Refine tracks on the pictures, and find their points in more images.
 
@@ -56,21 +56,21 @@ def follow_behind(
         run: inputs and options of the run.
         dynamic_masks: masks that exclude dynamic pixels, by image name.
         tracks: tracks of static points; few, since each is searched in many pictures.
-        placed: the registered images.
+        registered: the registered images.
 
     Returns:
         A track for each point, in these images, without outliers.
     """
-    masks = placed.masks_with(dynamic_masks)
+    masks = registered.masks_with(dynamic_masks)
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.shown)):
-        own = np.flatnonzero(placed.sequence == video)
-        frames = placed.frames[own]
+        own = np.flatnonzero(registered.sequence == video)
+        frames = registered.frames[own]
         seen, view = seen_in(tracks, frames)
         if len(view) == 0:
             continue
-        images = [placed.images[i] for i in own]
-        views = views_of(images, placed.cameras, [masks[i] for i in own])
+        images = [registered.images[i] for i in own]
+        views = views_of(images, registered.cameras, [masks[i] for i in own])
         points = triangulate_tracks(
             seen,
             view,
@@ -81,7 +81,7 @@ def follow_behind(
         if len(points.xyz) == 0:  # the camera of this video stands still
             continue
         expected, is_expected = expect_in_views(seen, view, points, views, frames)
-        first_frame = int(placed.first_frame[video])
+        first_frame = int(registered.first_frame[video])
         corrected = _on_pictures(run, video, expected, is_expected, first_frame)
         found = Tracks.concatenate(
             found, corrected.keep_observations(corrected.confirmed | ~is_expected)

@@ -8,7 +8,7 @@ import numpy as np
 
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, make_mask
-from colmap_av1.poses.dynamic.contradictions import Contradictions, PlacedTracks
+from colmap_av1.poses.dynamic.contradictions import Contradictions, TracksInCells
 from colmap_av1.util.arrays import Bools, Floats
 
 # Vote of a track that contradicts the poses by its motion alone, and not certainly. It is low
@@ -43,31 +43,31 @@ _CLOSED = 3
 
 
 def dynamic_cells(
-    placed: PlacedTracks, views: Sequence[PosedCamera], *, num_threads: int | None = None
+    tracks: TracksInCells, views: Sequence[PosedCamera], *, num_threads: int | None = None
 ) -> Bools:
     """Find the dynamic cells of images.
 
     Args:
-        placed: tracks of a video in its images, about one per cell.
+        tracks: tracks of a video in its images, about one per cell.
         views: the images, in temporal order.
         num_threads: number of threads; None: one per CPU. The result does not depend on it.
 
     Returns:
         Bool [images, rows, columns] the dynamic cells, dilated by one.
     """
-    found = Contradictions(placed, views, num_threads=num_threads)
+    found = Contradictions(tracks, views, num_threads=num_threads)
     by_motion, surely = found.by_motion, found.surely_by_motion
     dynamic = np.zeros(len(by_motion), np.bool_)
-    cells = np.zeros(placed.shape, np.bool_)
+    cells = np.zeros(tracks.shape, np.bool_)
     for _ in range(_PASSES):
         by_depth = found.by_depth(dynamic)
         behind = found.unseen(by_depth | dynamic)
         votes = np.where(by_depth | surely, 1.0, np.where(by_motion, _MOTION_VOTE, 0.0))
-        share = shares_above_usual(placed, votes, ~cells)
-        cells = _sure_regions(placed, share, behind)
+        share = shares_above_usual(tracks, votes, ~cells)
+        cells = _sure_regions(tracks, share, behind)
         if not cells.any():
             return cells
-        cells, dynamic = _cells_of_tracks(placed, cells, by_motion | by_depth)
+        cells, dynamic = _cells_of_tracks(tracks, cells, by_motion | by_depth)
     return _closed(strong_patches(cells, share))
 
 
@@ -78,11 +78,11 @@ def _sum_around(cells: Floats, width: int) -> Floats:
     return np.asarray(uniform_filter(cells, (1, width, width), mode="constant") * width**2)
 
 
-def shares_above_usual(placed: PlacedTracks, votes: Floats, still: Bools) -> Floats:
+def shares_above_usual(tracks: TracksInCells, votes: Floats, still: Bools) -> Floats:
     """Mean vote of the tracks around each cell, less the median over static cells.
 
     Args:
-        placed: the tracks.
+        tracks: the tracks.
         votes: float64 [num_tracks] vote of each track for being dynamic, from 0 to 1.
         still: bool [images, rows, columns] cells not known to be dynamic. Where people cover a
             third of the pictures, the median of all cells would be too high and hide their edges.
@@ -90,28 +90,28 @@ def shares_above_usual(placed: PlacedTracks, votes: Floats, still: Bools) -> Flo
     Returns:
         float64 [images, rows, columns]; -1 where there are too few tracks.
     """
-    tracks = _sum_around(placed.counts(np.ones(len(votes))), _AROUND)
-    enough = tracks > _MIN_TRACKS - 0.5
+    num_tracks = _sum_around(tracks.counts(np.ones(len(votes))), _AROUND)
+    enough = num_tracks > _MIN_TRACKS - 0.5
     if not enough.any():
-        return np.full(placed.shape, -1.0)
-    share = _sum_around(placed.counts(votes), _AROUND) / np.maximum(tracks, 1.0)
+        return np.full(tracks.shape, -1.0)
+    share = _sum_around(tracks.counts(votes), _AROUND) / np.maximum(num_tracks, 1.0)
     usual = share[enough & still] if (enough & still).any() else share[enough]
     return np.where(enough, share - float(np.median(usual)), -1.0)
 
 
-def _sure_regions(placed: PlacedTracks, share: Floats, behind: Floats) -> Bools:
+def _sure_regions(tracks: TracksInCells, share: Floats, behind: Floats) -> Bools:
     """Regions connected in space and time with enough cells that are certainly dynamic.
 
     Args:
-        placed: the tracks.
+        tracks: the tracks.
         share: float64 [images, rows, columns] see `shares_above_usual`.
         behind: float64 [images, rows, columns] number of points there that only other images see.
     """
     from scipy.ndimage import label  # noqa: PLC0415 - slow to import
 
-    tracks = _sum_around(placed.counts(np.ones(len(placed.residual))), _AROUND)
+    num_tracks = _sum_around(tracks.counts(np.ones(len(tracks.residual))), _AROUND)
     region, count = label(share > _MAY, structure=np.ones((3, 3, 3)))
-    sure = (share > _SURELY) & (_sum_around(behind, _AROUND) >= tracks)
+    sure = (share > _SURELY) & (_sum_around(behind, _AROUND) >= num_tracks)
     num_sure = np.bincount(region[sure], minlength=count + 1)
     num_cells = np.bincount(region.ravel(), minlength=count + 1)
     kept = (num_sure >= _MIN_SURE) & (num_sure >= _SURE_SHARE * num_cells)
@@ -133,14 +133,16 @@ def strong_patches(cells: Bools, share: Floats) -> Bools:
     return found
 
 
-def _cells_of_tracks(placed: PlacedTracks, cells: Bools, contradicts: Bools) -> tuple[Bools, Bools]:
+def _cells_of_tracks(
+    tracks: TracksInCells, cells: Bools, contradicts: Bools
+) -> tuple[Bools, Bools]:
     """The cells in which most tracks are dynamic, and the dynamic tracks."""
-    every = _sum_around(placed.counts(np.ones(len(contradicts))), _NEAR)
+    every = _sum_around(tracks.counts(np.ones(len(contradicts))), _NEAR)
     dynamic = np.zeros(len(contradicts), np.bool_)
     for _ in range(2):
-        within = placed.mean(cells[placed.image, placed.row, placed.column])
+        within = tracks.mean(cells[tracks.image, tracks.row, tracks.column])
         dynamic = (within > _MOSTLY) | ((within > _PARTLY) & contradicts)
-        around = _sum_around(placed.counts(dynamic), _NEAR)
+        around = _sum_around(tracks.counts(dynamic), _NEAR)
         cells = (around > _MOSTLY * every) & (around > _MIN_DYNAMIC - 0.5)
     return cells, dynamic
 

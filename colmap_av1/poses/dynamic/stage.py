@@ -16,7 +16,7 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.masks import mask_tracks
 from colmap_av1.images.track_images import MIN_IMAGES
 from colmap_av1.options import DensityOptions, TriangulateOptions
-from colmap_av1.poses.dynamic.contradictions import place_tracks
+from colmap_av1.poses.dynamic.contradictions import tracks_in_cells
 from colmap_av1.poses.dynamic.regions import dynamic_cells, mask_of_cells
 from colmap_av1.poses.posed_images import PosedImages, PosesResult, read_posed_images
 from colmap_av1.poses.run import Run
@@ -52,16 +52,16 @@ def dynamic_stage(
     """Find the dynamic regions of each image."""
 
     def make(partial: Path) -> DynamicResult:
-        placed = read_posed_images(run, posed, image_set)
+        registered = read_posed_images(run, posed, image_set)
         found: dict[str, Mask] = {}
         with run.clock.measure("dynamic"):
             for video in range(len(image_set.videos)):
-                own = np.flatnonzero(placed.sequence == video)
+                own = np.flatnonzero(registered.sequence == video)
                 if len(own) >= _MIN_IMAGES:
-                    found |= _dynamic_masks(run, tracks, placed, own)
+                    found |= _dynamic_masks(run, tracks, registered, own)
                 run.progress("dynamic", video + 1, len(image_set.videos))
         _write(partial / _FILE, found)
-        share = sum(1.0 - mask.share for mask in found.values()) / len(placed.images)
+        share = sum(1.0 - mask.share for mask in found.values()) / len(registered.images)
         return DynamicResult(share)
 
     return run_stage(
@@ -135,12 +135,12 @@ def _write(path: Path, masks: Mapping[str, Mask]) -> None:
 
 
 def _dynamic_masks(
-    run: Run, tracks: Tracks, placed: PosedImages, own: NDArray[np.intp]
+    run: Run, tracks: Tracks, registered: PosedImages, own: NDArray[np.intp]
 ) -> dict[str, Mask]:
     """Masks that exclude dynamic pixels from the images of a video, by image name."""
     num_threads = run.context.num_threads
-    images = [placed.images[i] for i in own]
-    views = views_of(images, placed.cameras, [None] * len(own))
+    images = [registered.images[i] for i in own]
+    views = views_of(images, registered.cameras, [None] * len(own))
     size = views[0].size
     cell = _CELL * max(1, round(max(size) / _USUAL_WIDTH))
     spread = DensityOptions(
@@ -152,7 +152,7 @@ def _dynamic_masks(
         wide_tracks=0,
     )
     seen, image = seen_in(
-        select_tracks(tracks.keep_frames(placed.frames[own]), spread), placed.frames[own]
+        select_tracks(tracks.keep_frames(registered.frames[own]), spread), registered.frames[own]
     )
     if len(image) == 0:
         return {}
@@ -167,8 +167,8 @@ def _dynamic_masks(
         options=how,
         num_threads=num_threads,
     )
-    placed_tracks = place_tracks(seen, image, points, views, cell=cell)
-    cells = dynamic_cells(placed_tracks, views, num_threads=num_threads)
+    in_cells = tracks_in_cells(seen, image, points, views, cell=cell)
+    cells = dynamic_cells(in_cells, views, num_threads=num_threads)
     return {
         own_image.name: mask_of_cells(dynamic, cell, size)
         for own_image, dynamic in zip(images, cells, strict=True)

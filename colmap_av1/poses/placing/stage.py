@@ -56,14 +56,14 @@ def place_stage(
     file = f"{run.stages.name}/in_place.npz"
 
     def make(partial: Path) -> PlaceResult:
-        placed = read_posed_images(run, posed, image_set)
+        registered = read_posed_images(run, posed, image_set)
         with run.clock.measure("place"):
             # Points are marked in the written pictures.
-            cameras = output_cameras(placed.cameras, undistort=undistort)
-            known = _surroundings(run, image_set, placed, positions)
-            found = find_placement(placed.images, cameras, known, options, seed)
+            cameras = output_cameras(registered.cameras, undistort=undistort)
+            known = _surroundings(run, image_set, registered, positions)
+            found = find_placement(registered.images, cameras, known, options, seed)
         write_place(partial, found)
-        images = placed.images
+        images = registered.images
         if found.is_moved:
             poses = np.array([image.cam_from_world for image in images])
             moved = transform_poses(found.similarity, poses)
@@ -72,7 +72,7 @@ def place_stage(
                 for image, pose in zip(images, moved, strict=True)
             ]
         (partial / file).parent.mkdir()
-        write_posed_model(partial / file, PosedModel(placed.cameras, images))
+        write_posed_model(partial / file, PosedModel(registered.cameras, images))
         return PlaceResult(
             poses=Path(file).name,
             num_registered=len(images),
@@ -92,10 +92,10 @@ def place_stage(
 
 
 def _surroundings(
-    run: Run, image_set: ImageSet, placed: PosedImages, positions: ImagePositions
+    run: Run, image_set: ImageSet, registered: PosedImages, positions: ImagePositions
 ) -> Surroundings:
     index = {name: i for i, name in enumerate(image_set.images.names)}
-    indices = [index[image.name] for image in placed.images]
+    indices = [index[image.name] for image in registered.images]
     places = positions.places
     priors = {
         image_set.images.names[i]: PosePrior(places[i], is_cartesian=False)
@@ -104,11 +104,11 @@ def _surroundings(
     }
 
     def lines(up: Floats) -> list[Floats]:
-        images = dict(some_spread([*zip(indices, placed.images, strict=True)]))
+        images = dict(some_spread([*zip(indices, registered.images, strict=True)]))
         return [
             vertical_lines(
                 picture,
-                placed.cameras[images[i].camera_id],
+                registered.cameras[images[i].camera_id],
                 images[i].cam_from_world,
                 up,
             )
