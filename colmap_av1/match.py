@@ -24,7 +24,7 @@ from colmap_av1.geometry.cameras import (
 from colmap_av1.images.files import alone_in, files_in
 from colmap_av1.images.image_set import ImageSet, ShownVideo, pictures_of
 from colmap_av1.images.inputs import Inputs, read_inputs
-from colmap_av1.images.photos import check_places, place_photos
+from colmap_av1.images.photos import check_copies, copy_photos
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_all_prepared
 from colmap_av1.images.recognising import check_content, frames_near
@@ -264,7 +264,7 @@ def match(
     inputs = read_inputs(video, photos, options)
     if folder is not None:
         check_outside(folder, photos)
-        check_places(inputs.photos, folder)
+        check_copies(inputs.photos, folder)
     context = RunContext.of(options.run, clock, progress)
     with unchanged(*inputs.states) as check_videos, ExitStack() as opened:
         scratch = None
@@ -313,7 +313,7 @@ def match(
             check_videos()
             with clock.measure("images"), alone_in(folder):
                 _check_images_of_other_runs(images, folder, before, options)
-                num_written = place_photos(inputs.photos, folder)
+                num_written = copy_photos(inputs.photos, folder)
                 labelled = zip(inputs.labels, images.videos, strict=True)
                 of_videos, blurred = write_all_prepared(labelled, folder, options.reading, progress)
                 num_written += of_videos

@@ -227,9 +227,9 @@ def nearest_in_cells(size: tuple[int, int], xy: Floats, depth: Floats) -> Floats
 
 def squares_of_cells(rows: Ints, columns: Ints, per_side: int) -> Floats:
     """Centres in pixels [n, 2] of the squares in cells, `per_side` ** 2 for each cell in turn."""
-    places = (np.arange(per_side) + 0.5) * (CELL / per_side)
-    x = columns[:, None] * CELL + np.tile(places, per_side)
-    y = rows[:, None] * CELL + np.repeat(places, per_side)
+    offsets = (np.arange(per_side) + 0.5) * (CELL / per_side)
+    x = columns[:, None] * CELL + np.tile(offsets, per_side)
+    y = rows[:, None] * CELL + np.repeat(offsets, per_side)
     return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)
 
 

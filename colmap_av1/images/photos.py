@@ -155,7 +155,7 @@ def _flat(file: Path) -> str:
     return "/".join(plain) + (suffix if suffix in IMAGE_EXTENSIONS else ".png")
 
 
-def place_photos(photos: Sequence[Photo], folder: Path) -> int:
+def copy_photos(photos: Sequence[Photo], folder: Path) -> int:
     """Copy photos to the folder of all images; existing copies stay.
 
     Returns:
@@ -179,7 +179,7 @@ def place_photos(photos: Sequence[Photo], folder: Path) -> int:
     return num_copied
 
 
-def check_places(photos: Sequence[Photo], folder: Path) -> None:
+def check_copies(photos: Sequence[Photo], folder: Path) -> None:
     """Check that no other file in the folder of all images has the name of a photo.
 
     Raises:

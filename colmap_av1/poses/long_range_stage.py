@@ -102,12 +102,12 @@ def _compared(
         points_of = _points_by_image(run, tracks, registered)
         check = LongRangeCheck(registered.images, registered.cameras, points_of.__getitem__)
         masks = registered.masks_with(dynamic_masks)
-        places = np.searchsorted(image_set.images.frames, registered.frames[check.wanted]).tolist()
-        index_of = dict(zip(places, check.wanted, strict=True))
-        for done, (place, picture) in enumerate(run.pictures(image_set)(places), start=1):
-            index = index_of[place]
+        indices = np.searchsorted(image_set.images.frames, registered.frames[check.wanted]).tolist()
+        index_of = dict(zip(indices, check.wanted, strict=True))
+        for done, (k, picture) in enumerate(run.pictures(image_set)(indices), start=1):
+            index = index_of[k]
             check.add(index, picture, masks[index])
-            run.progress("long range", done, len(places))
+            run.progress("long range", done, len(indices))
         return check.result()
 
 

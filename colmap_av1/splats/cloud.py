@@ -70,16 +70,16 @@ def splat_cloud(
     fewest, most, step = _EVEN_IMAGES
     even = evenly_spread(len(images), min(max(len(images) // step, fewest), most))
     stage = _stages(points, [images[i] for i in even])
-    places = evenly_spread(len(images), _FILLED_IMAGES)
+    chosen = evenly_spread(len(images), _FILLED_IMAGES)
     # Shuffle within a stage: a limit would otherwise drop points at the end of the video.
     shuffled = np.random.default_rng(0).permutation(len(stage))
     order = np.lexsort((shuffled, stage))[: int((stage < len(_SPACINGS)).sum())]
     if max_points is None:
         kept = points.take(np.sort(order))
-        return ModelPoints.concatenate([kept, _filling(kept, images, places)])
+        return ModelPoints.concatenate([kept, _filling(kept, images, chosen)])
     # Filling holes has priority over detail, but needs surfaces that determine their depth.
     kept = points.take(order[: round(_FOR_SURFACES * max_points)])
-    filled = _filling(kept, images, places)
+    filled = _filling(kept, images, chosen)
     filled = filled.take(np.arange(min(len(filled.xyz), max_points - len(kept.xyz))))
     kept = points.take(np.sort(order[: max_points - len(filled.xyz)]))
     return ModelPoints.concatenate([kept, filled])
@@ -111,16 +111,16 @@ def _stages(points: ModelPoints, images: Sequence[PosedCamera]) -> Ints:
     return stage
 
 
-def _filling(kept: ModelPoints, images: Sequence[PosedCamera], places: list[int]) -> ModelPoints:
-    """Points that fill the holes of the images at `places`, one point of each cell first."""
-    nearest = [nearest_depth(images[place], kept.xyz) for place in places]
+def _filling(kept: ModelPoints, images: Sequence[PosedCamera], chosen: list[int]) -> ModelPoints:
+    """Points that fill the holes of the chosen images, one point of each cell first."""
+    nearest = [nearest_depth(images[index], kept.xyz) for index in chosen]
     surfaces = [without_gaps(grid) for grid in nearest]
     usual = _usual_depth(surfaces)
     filled: list[ModelPoints] = [kept.take(np.empty(0, np.int64))]
     is_first = [np.empty(0, np.bool_)]
     added = np.empty((0, 3))
-    for number in _spread_order(len(places)) * _ROUNDS:
-        own = images[places[number]]
+    for number in _spread_order(len(chosen)) * _ROUNDS:
+        own = images[chosen[number]]
         grid = without_gaps(np.minimum(nearest[number], nearest_depth(own, added)))
         rows, columns = np.nonzero(np.isinf(grid) & own.valid_cells)
         if len(rows) == 0:
@@ -128,18 +128,18 @@ def _filling(kept: ModelPoints, images: Sequence[PosedCamera], places: list[int]
         depth = _depth_of_holes(grid, usual)
         xy, cell, first = _squares(own, rows, columns)
         is_first.append(first)
-        beside = range(max(number - _BESIDE, 0), min(number + _BESIDE + 1, len(places)))
+        beside = range(max(number - _BESIDE, 0), min(number + _BESIDE + 1, len(chosen)))
         xyz = _behind(
             own,
             xy,
             depth[rows, columns][cell],
             float(depth.max()),
-            [(images[places[i]], surfaces[i]) for i in beside if i != number],
+            [(images[chosen[i]], surfaces[i]) for i in beside if i != number],
         )
         added = np.concatenate([added, xyz])
-        around = (places[number] - 1, places[number], places[number] + 1)
+        around = (chosen[number] - 1, chosen[number], chosen[number] + 1)
         there = [i for i in around if 0 <= i < len(images)]
-        filled.append(_with_observations(xyz, images, there, places[number]))
+        filled.append(_with_observations(xyz, images, there, chosen[number]))
     order = np.argsort(~np.concatenate(is_first), kind="stable")
     return ModelPoints.concatenate(filled).take(order)
 
@@ -168,9 +168,9 @@ def _depth_of_holes(grid: Floats, usual: float) -> Floats:
 
     depth = grid.copy()
     holes, count = label(np.isinf(grid), structure=np.ones((3, 3)))
-    for number, place in enumerate(find_objects(holes, count), start=1):
+    for number, found in enumerate(find_objects(holes, count), start=1):
         # The bounding box of the hole and its neighbouring cells.
-        box = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in place)
+        box = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in found)
         hole = holes[box] == number
         edge = np.argwhere(binary_dilation(hole, np.ones((3, 3))) & np.isfinite(grid[box]))
         if len(edge) == 0:

@@ -201,11 +201,11 @@ def _coloured(
     Reading the written images instead would take several times as long.
     """
     colours = Colours(cloud, [view.size for view in views])
-    places = np.searchsorted(image_set.images.frames, registered.frames).tolist()
-    index_of = {place: index for index, place in enumerate(places)}
+    indices = np.searchsorted(image_set.images.frames, registered.frames).tolist()
+    index_of = {k: index for index, k in enumerate(indices)}
     with run.clock.measure("colours"):
-        for done, (place, picture) in enumerate(run.pictures(image_set)(places), start=1):
-            index = index_of[place]
+        for done, (k, picture) in enumerate(run.pictures(image_set)(indices), start=1):
+            index = index_of[k]
             colours.add(index, picture, undistort(index))
             run.progress("colours", done, len(views))
         return replace(cloud, rgb=colours.rgb())

@@ -71,7 +71,7 @@ def _back(steps: Floats, shift: int) -> Floats:
 def at_middle_of_read_out(
     xy: NDArray[np.floating],
     velocity: NDArray[np.floating],
-    place: NDArray[np.floating],
+    time: NDArray[np.floating],
     read_out: float,
 ) -> Floats:
     """Positions of points in the middle of the read-out, given those when their row is read.
@@ -79,15 +79,14 @@ def at_middle_of_read_out(
     Args:
         xy: [n, 2] pixels.
         velocity: [n, 2] pixels per frame.
-        place: [n] position of their rows in the order of read-out, from -0.5 for the first row to
-            0.5 for the last.
+        time: [n] when their rows are read, from -0.5 for the first row to 0.5 for the last.
         read_out: time from the first row to the last, in frames.
     """
-    return np.asarray(xy - read_out * place[:, None] * velocity, dtype=np.float64)
+    return np.asarray(xy - read_out * time[:, None] * velocity, dtype=np.float64)
 
 
-def row_places(xy: NDArray[np.floating], size: tuple[int, int], down: tuple[int, int]) -> Floats:
-    """Positions [n] of points in the order of read-out, see `at_middle_of_read_out`.
+def row_times(xy: NDArray[np.floating], size: tuple[int, int], down: tuple[int, int]) -> Floats:
+    """When the rows of points are read, [n], see `at_middle_of_read_out`.
 
     Args:
         xy: [n, 2] pixels of shown pictures.
@@ -106,8 +105,8 @@ def correct_tracks(tracks: Tracks, read_out: float, down: tuple[int, int]) -> Tr
         tracks: tracks through all frames.
         read_out: time from the first row to the last, in frames; negative if rows are read from
             the bottom.
-        down: as in `row_places`.
+        down: as in `row_times`.
     """
-    place = row_places(tracks.xy, (tracks.width, tracks.height), down)
-    moved = at_middle_of_read_out(tracks.xy, velocities(tracks), place, read_out)
+    time = row_times(tracks.xy, (tracks.width, tracks.height), down)
+    moved = at_middle_of_read_out(tracks.xy, velocities(tracks), time, read_out)
     return replace(tracks, xy=moved.astype(np.float32))

@@ -56,7 +56,7 @@ def shutter_settings(camera: CameraOptions) -> tuple[str, ...]:
 
 
 def rows_down(display: Display, size: tuple[int, int]) -> tuple[int, int]:
-    """The direction in the displayed picture in which the sensor reads its rows, see `row_places`.
+    """The direction in the displayed picture in which the sensor reads its rows, see `row_times`.
 
     The sensor is assumed to be wider than high: a picture that is stored upright was rotated before
     it was stored.

@@ -9,7 +9,7 @@ import numpy as np
 
 from colmap_av1.matching.focal import estimate_focal_length, lowest, pose_loss
 from colmap_av1.matching.pairs import ImageKeypoints, pair_matches
-from colmap_av1.tracks.shutter import at_middle_of_read_out, row_places, velocities
+from colmap_av1.tracks.shutter import at_middle_of_read_out, row_times, velocities
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats
 from colmap_av1.util.spread import evenly_spread
@@ -51,16 +51,16 @@ class ReadOut:
 
 @dataclass(frozen=True)
 class _View:
-    """Matches of a pair of frames: pixels from the centre, velocities, places in the read-out."""
+    """Matches of a pair of frames: pixels from the centre, velocities, times in the read-out."""
 
     xy: tuple[Floats, Floats]
     velocity: tuple[Floats, Floats]
-    place: tuple[Floats, Floats]
+    time: tuple[Floats, Floats]
 
     def corrected(self, read_out: float) -> tuple[Floats, Floats]:
         a, b = (
-            np.ascontiguousarray(at_middle_of_read_out(xy, velocity, place, read_out))
-            for xy, velocity, place in zip(self.xy, self.velocity, self.place, strict=True)
+            np.ascontiguousarray(at_middle_of_read_out(xy, velocity, time, read_out))
+            for xy, velocity, time in zip(self.xy, self.velocity, self.time, strict=True)
         )
         return a, b
 
@@ -77,7 +77,7 @@ def estimate_read_out(
 
     Args:
         tracks: tracks through all frames.
-        down: direction in which rows are read, see `row_places`.
+        down: direction in which rows are read, see `row_times`.
         focal_length: in pixels; if None, it is estimated from the tracks.
         seed: the random seed.
 
@@ -107,7 +107,7 @@ def _views(tracks: Tracks, down: tuple[int, int], seed: int) -> list[_View]:
     """Pairs of frames along the video, far enough apart for enough motion if possible."""
     rng = np.random.default_rng(seed)
     speed = velocities(tracks)
-    place = row_places(tracks.xy, (tracks.width, tracks.height), down)
+    time = row_times(tracks.xy, (tracks.width, tracks.height), down)
     centre = np.array([tracks.width, tracks.height]) / 2
     order, bounds = tracks.by_frame()
     number = tracks.track
@@ -140,7 +140,7 @@ def _views(tracks: Tracks, down: tuple[int, int], seed: int) -> list[_View]:
                     tracks.xy[b].astype(np.float64) - centre,
                 ),
                 (speed[a].astype(np.float64), speed[b].astype(np.float64)),
-                (place[a].astype(np.float64), place[b].astype(np.float64)),
+                (time[a].astype(np.float64), time[b].astype(np.float64)),
             )
         )
     return views
