@@ -35,7 +35,6 @@ from colmap_av1.poses.long_range import LongRangeErrors
 from colmap_av1.poses.mapper import map_poses
 from colmap_av1.poses.placing.placement import (
     Place,
-    Placement,
     Surroundings,
     find_placement,
     write_place,
@@ -147,12 +146,11 @@ def map_database(
             )
         with clock.measure("place"):
             try:
-                placement = _place(partial, database, image_path, place, options.seed)
+                world, place_warnings = _place(partial, database, image_path, place, options.seed)
             except (ImageError, OptionError) as error:  # The model is valid without a place.
-                placement = Placement(
-                    warnings=(f"the model keeps the mapper's coordinates: {error}",)
-                )
-            write_place(partial, placement)
+                world = Place()
+                place_warnings = (f"the model keeps the mapper's coordinates: {error}",)
+            write_place(partial, world)
     model = read_model(output / "0")
     unreadable = None
     with clock.measure("long range"):
@@ -162,7 +160,7 @@ def map_database(
             unreadable = f"skipped the long-range check: {error}"
             found = check_model(model, database=database)
     warnings = (
-        *placement.warnings,
+        *place_warnings,
         _missing(checked.num_images, num_registered),
         checked.depth.warning,
         focal_length_warning(posed_model(model).cameras.values()),
@@ -179,7 +177,7 @@ def map_database(
         forward_motion=forward,
         num_images=checked.num_images,
         num_registered=num_registered,
-        place=placement.place,
+        place=world,
         figures=found.figures,
         expected_error=found.expected_error,
         long_range=found.long_range,
@@ -285,7 +283,7 @@ def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:
 
 def _place(
     output: Path, database: Path, image_path: Path, options: PlaceOptions, seed: int
-) -> Placement:
+) -> tuple[Place, tuple[str, ...]]:
     """Place the model in folder 0 of the output in the world."""
     folder = output / "0"
     model = read_model(folder)
@@ -303,11 +301,11 @@ def _place(
         ]
 
     known = Surroundings(read_pose_priors(database), lines=lines)
-    found = find_placement(images, dict(model.cameras), known, options, seed)
+    found, place_warnings = find_placement(images, dict(model.cameras), known, options, seed)
     if found.is_moved:
         model.transform(found.similarity)
         model.write_binary(folder)
-    return found
+    return found, place_warnings
 
 
 def _check_input(database: Path, image_path: Path, place: PlaceOptions) -> DatabaseCheck:

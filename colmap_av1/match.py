@@ -647,14 +647,19 @@ def _correct_rolling_shutter(
 ) -> PreparedImages:
     """The images with their tracks corrected for the rolling shutter, if requested."""
     tracked = prepared.tracked
-    tracks, read_out = correct_rolling_shutter(
+    corrected = correct_rolling_shutter(
         tracked.tracks,
         prepared.display,
         prepared.source.pictures.frame_rate,
         options.camera,
         context,
     )
-    video = replace(tracked.video, tracks=tracks, read_out=read_out)
+    video = replace(
+        tracked.video,
+        tracks=corrected.tracks,
+        read_out=corrected.read_out,
+        warnings=(*tracked.video.warnings, *corrected.warnings),
+    )
     return replace(prepared, tracked=replace(tracked, video=video))
 
 

@@ -131,7 +131,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
                 context=run.context,
             )
         chosen, tracked = found.chosen, found.video
-        tracks, read_out = correct_rolling_shutter(
+        corrected = correct_rolling_shutter(
             tracked.tracks,
             shown.display,
             shown.frame_rate,
@@ -139,8 +139,9 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
             run.context,
         )
         fast = fast_frames(tracked.ends)
-        # Later stages need no other frames of a long video.
-        tracks = tracks.keep_frames(chosen.frames) if is_long else tracks
+        tracks = corrected.tracks
+        if is_long:  # Later stages need no other frames of a long video.
+            tracks = tracks.keep_frames(chosen.frames)
         _check_chosen(run, chosen, tracks.num_frames)
         with (partial / f"{name}.npz").open("wb") as file:
             np.savez(
@@ -152,7 +153,12 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
                 fast=fast,
             )
         check_unchanged(*source.files)
-        return TracksResult(tracks.num_frames, tracks.num_tracks, read_out, tracked.warnings)
+        return TracksResult(
+            tracks.num_frames,
+            tracks.num_tracks,
+            corrected.read_out,
+            (*tracked.warnings, *corrected.warnings),
+        )
 
     mapping = run.options.mapping
     # The images of a long video are chosen by the tracks that poses are estimated from, and include

@@ -225,7 +225,7 @@ def test_known_distance_between_cameras_or_marks_gives_the_scale() -> None:
     assert distance(text) == pytest.approx(1.5 * world.scale, rel=1e-3)
     known = Surroundings({})
     options = PlaceOptions(scale=text)
-    found = find_placement([*images.values()], {1: CAMERA}, known, options, 0)
+    found, _ = find_placement([*images.values()], {1: CAMERA}, known, options, 0)
     assert found.units == "metres"
     assert found.similarity.scale * world.scale == pytest.approx(1, rel=1e-3)
     for wrong, reason in (
@@ -253,7 +253,7 @@ def test_known_distance_overrides_the_scale_of_positions() -> None:
     apart = float(np.linalg.norm(centres[0] - centres[30]))
     for scale, expected in ((None, 1.1), (f"{apart}=0.png,30.png", 1.0)):
         options = PlaceOptions(scale=scale)
-        found = find_placement(images, {1: CAMERA}, Surroundings(priors), options, 0)
+        found, _ = find_placement(images, {1: CAMERA}, Surroundings(priors), options, 0)
         assert found.similarity.scale * world.scale == pytest.approx(expected, rel=1e-6)
         moved = camera_centres(
             transform_poses(found.similarity, np.array([i.cam_from_world for i in images]))
@@ -276,17 +276,32 @@ def test_positions_on_both_sides_of_the_date_line_place_a_model(longitude: float
         )
         for image, (x, y, z) in zip(images, centres, strict=True)
     }
-    found = find_placement(images, {1: CAMERA}, Surroundings(priors), PlaceOptions(), 0)
-    assert not found.warnings
+    found, place_warnings = find_placement(
+        images, {1: CAMERA}, Surroundings(priors), PlaceOptions(), 0
+    )
+    assert not place_warnings
     assert found.units == "metres"
     assert found.origin is not None
     assert abs((found.origin.longitude - longitude + 180) % 360 - 180) < 1e-3
     assert -180 <= found.origin.longitude < 180
 
 
+def test_rejected_positions_name_only_the_options_that_would_help() -> None:
+    images = images_of(transform_poses(elsewhere(), walk()))
+    here = PosePrior(np.array([1.0, 2.0, 3.0]), is_cartesian=True)
+    known = Surroundings({image.name: here for image in images})
+    ends = f"2.5={images[0].name},{images[30].name}"
+    for scale, upright in ((None, False), (None, True), (ends, False), (ends, True)):
+        options = PlaceOptions(upright=upright, scale=scale)
+        found, (warning,) = find_placement(images, {1: CAMERA}, known, options, 0)
+        assert found.units == ("arbitrary" if scale is None else "metres")
+        assert ("--scale" in warning) == (scale is None)
+        assert ("--upright" in warning) == (not upright)
+
+
 def test_a_single_position_is_kept_when_a_model_is_turned_upright() -> None:
     images = images_of(transform_poses(elsewhere(), walk()))
     known = Surroundings({}, place=(1.0, 2.0, 3.0))
-    found = find_placement(images, {1: CAMERA}, known, PlaceOptions(upright=True), 0)
+    found, _ = find_placement(images, {1: CAMERA}, known, PlaceOptions(upright=True), 0)
     assert found.axes == "z up"
     assert any("single position" in how for how in found.how)

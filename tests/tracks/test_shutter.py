@@ -140,11 +140,10 @@ def test_rolling_shutter_option() -> None:
     tracks = tracks_of(0.45)
     for wanted, found in (("none", None), ("15", 15.0), ("-7.5", -7.5)):
         options = MatchOptions(camera=CameraOptions(rolling_shutter=wanted))
-        moved, read_out = correct_rolling_shutter(
-            tracks, Display(), RATE, options.camera, RunContext()
-        )
-        assert read_out == pytest.approx(found)
-        assert (moved is tracks) == (found is None)
+        corrected = correct_rolling_shutter(tracks, Display(), RATE, options.camera, RunContext())
+        assert corrected.read_out == pytest.approx(found)
+        assert (corrected.tracks is tracks) == (found is None)
+        assert not corrected.warnings
     options = MatchOptions(
         camera=CameraOptions(
             rolling_shutter="estimate",
@@ -152,12 +151,14 @@ def test_rolling_shutter_option() -> None:
             camera_params=f"{FOCAL},{WIDTH / 2},{HEIGHT / 2}",
         )
     )
-    _, read_out = correct_rolling_shutter(tracks, Display(), RATE, options.camera, RunContext())
-    assert read_out == pytest.approx(15, abs=1.5)
-    assert correct_rolling_shutter(tracks, Display(), None, options.camera, RunContext()) == (
-        tracks,
-        None,
-    )
+    corrected = correct_rolling_shutter(tracks, Display(), RATE, options.camera, RunContext())
+    assert corrected.read_out == pytest.approx(15, abs=1.5)
+    fisheye = CameraOptions(rolling_shutter="estimate", camera_model="OPENCV_FISHEYE")
+    for rate, camera, word in ((None, options.camera, "rate"), (RATE, fisheye, "fisheye")):
+        unknown = correct_rolling_shutter(tracks, Display(), rate, camera, RunContext())
+        assert unknown.tracks is tracks
+        assert unknown.read_out is None
+        assert word in unknown.warnings[0]
     for wrong in ("soon", "101", "nan"):
         with pytest.raises(OptionError, match="milliseconds"):
             CameraOptions(rolling_shutter=wrong)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from colmap_av1.geometry.cameras import is_nearly_pinhole, is_square
 from colmap_av1.matching.shutter.estimate import estimate_read_out
 from colmap_av1.options import CameraOptions
@@ -12,41 +14,70 @@ from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.display import UPRIGHT, Display
 
 
+@dataclass(frozen=True)
+class ShutterCorrection:
+    """Tracks that are corrected for a rolling shutter as far as possible.
+
+    Attributes:
+        tracks: the tracks.
+        read_out: the read-out time in milliseconds; None if nothing is corrected.
+        warnings: why nothing is corrected although it was requested.
+    """
+
+    tracks: Tracks
+    read_out: float | None = None
+    warnings: tuple[str, ...] = ()
+
+
 def correct_rolling_shutter(
     tracks: Tracks,
     display: Display,
     rate: float | None,
     camera: CameraOptions,
     context: RunContext,
-) -> tuple[Tracks, float | None]:
+) -> ShutterCorrection:
     """Move tracks to their positions in the middle of each picture's read-out.
 
     Args:
         tracks: tracks of all frames; neighbouring observations give their velocities.
         display: how players show the pictures.
-        rate: frames per second; if None (unknown), the tracks are returned unchanged.
+        rate: frames per second; None if unknown.
         camera: the read-out time, the model and given intrinsics.
         context: its clock gets the stage "shutter".
-
-    Returns:
-        The tracks, and the read-out time in milliseconds; None if nothing is corrected.
     """
-    wanted = camera.rolling_shutter
-    if wanted == "none" or rate is None or tracks.num_frames == 0:
-        return tracks, None
+    if camera.rolling_shutter == "none" or tracks.num_frames == 0:
+        return ShutterCorrection(tracks)
     with context.clock.measure("shutter"):
         down = rows_down(display, (tracks.width, tracks.height))
-        if wanted != "estimate":
-            read_out = float(wanted) / 1000 * rate
-        elif is_nearly_pinhole(camera.camera_model) and is_square(display.pixel_aspect):
-            focal = _focal_length(camera)
-            found = estimate_read_out(tracks, down, focal, context.seed)
-            if isinstance(found, str):
-                return tracks, None
-            read_out = found.frames
-        else:
-            return tracks, None
-        return correct_tracks(tracks, read_out, down), read_out / rate * 1000
+        found = _read_out(tracks, display, rate, camera, down=down, seed=context.seed)
+        if rate is None or isinstance(found, str):
+            return ShutterCorrection(
+                tracks, warnings=(f"keypoints are not corrected for a rolling shutter: {found}",)
+            )
+        return ShutterCorrection(correct_tracks(tracks, found, down), found / rate * 1000)
+
+
+def _read_out(
+    tracks: Tracks,
+    display: Display,
+    rate: float | None,
+    camera: CameraOptions,
+    *,
+    down: tuple[int, int],
+    seed: int,
+) -> float | str:
+    """The read-out time in frames, or why it is unknown."""
+    if rate is None:
+        return "the video has no frame rate"
+    if camera.rolling_shutter != "estimate":
+        return float(camera.rolling_shutter) / 1000 * rate
+    if not is_nearly_pinhole(camera.camera_model) or not is_square(display.pixel_aspect):
+        return (
+            "the time is not estimated for fisheye lenses and pixels that are not square: give it "
+            "in milliseconds"
+        )
+    found = estimate_read_out(tracks, down, _focal_length(camera), seed)
+    return found if isinstance(found, str) else found.frames
 
 
 def shutter_settings(camera: CameraOptions) -> tuple[str, ...]:

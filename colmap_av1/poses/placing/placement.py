@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -55,51 +56,34 @@ class Place:
         translation: its translation, [3].
     """
 
-    units: str
-    axes: str
-    origin: Origin | None
-    how: tuple[str, ...]
-    scale: float
-    rotation: tuple[tuple[float, ...], ...]
-    translation: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Transform of a model to world coordinates.
-
-    Attributes:
-        similarity: from the mapper's coordinates to those of the model.
-        units: "metres" or "arbitrary".
-        axes: description of the axes.
-        origin: position of the origin on the Earth; None if it is unknown.
-        how: descriptions of the data that determined the placement.
-        warnings: warnings about the placement.
-    """
-
-    similarity: pycolmap.Sim3d = field(default_factory=pycolmap.Sim3d)
     units: str = "arbitrary"
     axes: str = "of the mapper"
     origin: Origin | None = None
     how: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    scale: float = 1.0
+    rotation: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    translation: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @property
+    def similarity(self) -> pycolmap.Sim3d:
+        """The similarity from the mapper's coordinates to the model's."""
+        rotation = pycolmap.Rotation3d(np.array(self.rotation))
+        return pycolmap.Sim3d(self.scale, rotation, np.array(self.translation))
 
     @property
     def is_moved(self) -> bool:
-        """Whether the model is transformed."""
+        """Whether the model has other coordinates than those of the mapper."""
         return not np.array_equal(self.similarity.matrix(), np.eye(3, 4))
 
-    @property
-    def place(self) -> Place:
-        """The content of `place.json`."""
-        return Place(
-            units=self.units,
-            axes=self.axes,
-            origin=self.origin,
-            how=self.how,
-            scale=float(self.similarity.scale),
-            rotation=tuple(tuple(row) for row in self.similarity.rotation.matrix().tolist()),
-            translation=tuple(self.similarity.translation.tolist()),
+    def moved_to(self, similarity: pycolmap.Sim3d, how: str, **changes: Any) -> Place:
+        """The place with another similarity, and a description of the data that determined it."""
+        return replace(
+            self,
+            how=(*self.how, how),
+            scale=float(similarity.scale),
+            rotation=tuple(tuple(row) for row in similarity.rotation.matrix().tolist()),
+            translation=tuple(similarity.translation.tolist()),
+            **changes,
         )
 
 
@@ -128,7 +112,7 @@ def find_placement(
     known: Surroundings,
     options: PlaceOptions,
     seed: int,
-) -> Placement:
+) -> tuple[Place, tuple[str, ...]]:
     """Determine the placement of a model.
 
     Args:
@@ -138,33 +122,46 @@ def find_placement(
         options: the options.
         seed: random seed of the samples.
 
+    Returns:
+        The placement, and warnings about it.
+
     Raises:
         OptionError: the known distance cannot be measured in the model, see `model_distance`.
     """
     poses = np.array([image.cam_from_world for image in images])
-    found = Placement()
+    found = Place()
+    reason = None
     if options.align == "gps":
-        found = _by_positions(images, poses, known, seed)
+        by_positions = _by_positions(images, poses, known, seed)
+        if isinstance(by_positions, str):
+            reason = by_positions
+        else:
+            found = by_positions
     if options.upright and not found.is_moved:
         up, how = _up(poses, known)
         turned = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation_to_up(up)), np.zeros(3))
-        found = replace(found, similarity=turned, axes="z up", how=(*found.how, f"z up by {how}"))
+        found = found.moved_to(turned, f"z up by {how}", axes="z up")
     if options.scale is not None:
         found = _with_distance(found, images, cameras, options.scale)
-    return found
+    if reason is None:
+        return found, ()
+    missing = [] if options.upright else ["its axes are arbitrary: give --upright"]
+    missing += [] if options.scale is not None else ["its scale is arbitrary: give --scale"]
+    return found, ("; ".join([f"the positions do not place the model: {reason}", *missing]),)
 
 
 def _by_positions(
     images: Sequence[ModelImage], poses: Floats, known: Surroundings, seed: int
-) -> Placement:
+) -> Place | str:
+    """The placement by the positions of images, or the reason why they do not place the model."""
     at = [i for i, image in enumerate(images) if image.name in known.priors]
     priors = [known.priors[images[i].name] for i in at]
     if not priors:
         if known.place is None:
-            return Placement()
+            return Place()
         latitude, longitude, altitude = known.place
         where = f"{latitude:.5f}, {longitude:.5f}, {altitude:.1f} m"
-        return Placement(how=(f"a single position, {where}, which gives no scale or direction",))
+        return Place(how=(f"a single position, {where}, which gives no scale or direction",))
     cartesian = sum(prior.is_cartesian for prior in priors)
     kind = cartesian * 2 > len(priors)
     at = [i for i, prior in zip(at, priors, strict=True) if prior.is_cartesian == kind]
@@ -180,18 +177,13 @@ def _by_positions(
     fits = [fit_path(path, positions, up, seed) for up in _rough_ups(poses[at], gravity)]
     fit = max(fits, key=lambda f: f.num_used if isinstance(f, PathFit) else -1)
     if isinstance(fit, str):
-        return Placement(
-            warnings=(
-                f"the positions do not place the model: {fit}; its scale and "
-                "axes are arbitrary: give --scale and --upright",
-            )
-        )
+        return fit
     how = (
         f"{fit.num_used} of {len(at)} positions with a residual of {fit.error:.2f} m, scale "
         f"accurate to {fit.scale_error:.1%}"
     )
     axes = "of the pose priors" if origin is None else "x east, y north, z up"
-    return Placement(fit.similarity, "metres", axes, origin, (how,))
+    return Place("metres", axes, origin).moved_to(fit.similarity, how)
 
 
 def _rough_ups(poses: Floats, gravity: Floats | None) -> list[Up]:
@@ -217,11 +209,11 @@ def _up(poses: Floats, known: Surroundings) -> tuple[Floats, str]:
 
 
 def _with_distance(
-    found: Placement,
+    found: Place,
     images: Sequence[ModelImage],
     cameras: Mapping[int, pycolmap.Camera],
     text: str,
-) -> Placement:
+) -> Place:
     """The placement with the scale of a known distance."""
     known = parse_distance(text)
     distance = model_distance(known, {image.name: image for image in images}, cameras)
@@ -235,13 +227,13 @@ def _with_distance(
     how = f"scale by {known}"
     if found.units == "metres":
         how += f", the scale of the positions differs by {before.scale / scale - 1:+.1%}"
-    return replace(found, similarity=moved, units="metres", how=(*found.how, how))
+    return found.moved_to(moved, how, units="metres")
 
 
-def write_place(folder: Path, placement: Placement) -> None:
+def write_place(folder: Path, place: Place) -> None:
     """Write `place.json`.
 
     Raises:
         OSError: the file cannot be written.
     """
-    (folder / PLACE_FILE).write_text(json.dumps(asdict(placement.place), indent=1) + "\n")
+    (folder / PLACE_FILE).write_text(json.dumps(asdict(place), indent=1) + "\n")

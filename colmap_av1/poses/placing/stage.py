@@ -61,7 +61,7 @@ def place_stage(
             # Points are marked in the written pictures.
             cameras = output_cameras(registered.cameras, undistort=undistort)
             known = _surroundings(run, image_set, registered, positions)
-            found = find_placement(registered.images, cameras, known, options, seed)
+            found, place_warnings = find_placement(registered.images, cameras, known, options, seed)
         write_place(partial, found)
         images = registered.images
         if found.is_moved:
@@ -76,8 +76,8 @@ def place_stage(
         return PlaceResult(
             poses=Path(file).name,
             num_registered=len(images),
-            place=found.place,
-            place_warnings=tuple(found.warnings),
+            place=found,
+            place_warnings=place_warnings,
         )
 
     return run_stage(
