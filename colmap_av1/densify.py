@@ -25,14 +25,12 @@ from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.track_points import (
     LEAST_AGREEING,
     Colours,
+    TriangulatedTracks,
     chaining_for_points,
     fitting_in_images,
     mean_error,
-    seen_in,
-    to_model_points,
     triangulate_tracks,
 )
-from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.images.image_set import ImageSet, Pictures, ShownVideo, pictures_of
 from colmap_av1.images.inputs import Inputs, paths_of, read_inputs
 from colmap_av1.images.of_videos import VideoImages, images_of_videos
@@ -180,19 +178,18 @@ def densify(
         images = [posed[name] for name in image_set.images.names]
         views = views_of(images, cameras, image_set.masks)
         row = Tracks.in_sequence([own.tracks for own in tracked], image_set.num_frames)
-        seen, view = seen_in(row, image_set.images.frames)
         with clock.measure("points"):
-            points = triangulate_tracks(
-                seen,
-                view,
+            triangulated = triangulate_tracks(
+                row,
+                image_set.images.frames,
                 views,
                 options=options.triangulate,
                 num_threads=options.match.run.num_threads,
                 progress=progress,
             )
-        agreeing = _agreement(model, points)
+        _check_agreement(model, triangulated)
         of_tracks = fitting_in_images(
-            to_model_points(points, view, seen),
+            triangulated.model_points(),
             views,
             options.triangulate.max_reprojection_error,
         )
@@ -216,8 +213,8 @@ def densify(
         conversion=inputs.conversion([words for _, words in found]),
         num_images=len(images),
         masked=image_set.masked,
-        num_tracks=points.num_tracks,
-        agreeing=agreeing,
+        num_tracks=triangulated.points.num_tracks,
+        agreeing=triangulated.agreement,
         num_points=len(cloud.xyz),
         num_model_points=reconstruction.num_points3D(),
         coverage=covered,
@@ -340,20 +337,16 @@ def _write_gaussians(
     return Path(path)
 
 
-def _agreement(model: Path, points: TriangulatedPoints) -> float:
-    """Share of the tracks that agree with the poses.
-
-    Raises:
-        ModelError: the model is of another video.
-    """
-    agreeing = points.num_agreeing / max(points.num_tracks, 1)
-    if agreeing < LEAST_AGREEING or len(points.xyz) == 0:
+def _check_agreement(model: Path, triangulated: TriangulatedTracks) -> None:
+    """Raise `ModelError` if the model is of another video."""
+    num_points = len(triangulated.points.xyz)
+    if triangulated.agreement < LEAST_AGREEING or num_points == 0:
         raise ModelError(
-            f"{model}: only {agreeing:.0%} of the video's tracks agree with the model's poses, "
-            f"{len(points.xyz)} points are triangulated: give the video that the model's images "
-            "come from, and check that their names are frame numbers (--first_number, --frame_list)"
+            f"{model}: only {triangulated.agreement:.0%} of the video's tracks agree with the "
+            f"model's poses, {num_points} points are triangulated: give the video that the model's "
+            "images come from, and check that their names are frame numbers (--first_number, "
+            "--frame_list)"
         )
-    return agreeing
 
 
 def _check_distorted(model: Path) -> None:

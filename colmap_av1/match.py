@@ -624,12 +624,7 @@ def _match_pairs(
     return match_images(
         image_set,
         [
-            SelectedTracks(
-                own.source.pictures.path,
-                own.tracked.tracks,
-                own.tracked.video.inter_share,
-                fast,
-            )
+            SelectedTracks(own.tracked.tracks, own.tracked.video.inter_share, fast)
             for own, fast in zip(videos, images.fast, strict=True)
         ],
         cameras,

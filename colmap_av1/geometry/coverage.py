@@ -165,9 +165,11 @@ class PosedCamera:
 def views_of(
     images: Sequence[ModelImage],
     cameras: Mapping[int, pycolmap.Camera],
-    masks: Sequence[Mask | None],
+    masks: Sequence[Mask | None] | None = None,
 ) -> list[PosedCamera]:
     """The camera, pose and mask of each image; `cameras` is by camera id."""
+    if masks is None:
+        masks = [None] * len(images)
     return [
         PosedCamera(cameras[image.camera_id], image.cam_from_world, mask)
         for image, mask in zip(images, masks, strict=True)
@@ -200,7 +202,7 @@ def coverage_of_model(reconstruction: pycolmap.Reconstruction) -> float:
     """`coverage` of a pycolmap.Reconstruction's points in its images."""
     images = sorted(posed_images(reconstruction).values(), key=lambda image: image.name)
     cameras = reconstruction.cameras
-    views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in images]
+    views = views_of(images, dict(cameras))
     return coverage(views, point_positions(reconstruction))
 
 

@@ -10,7 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.colmap_model import camera_centres
-from colmap_av1.geometry.triangulation import TriangulatedPoints
+from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.util.digests import seed_of
@@ -44,8 +44,7 @@ class Sightings:
 
 
 def sightings_of(
-    points: TriangulatedPoints,
-    seen: Tracks,
+    known: TriangulatedTracks,
     tracks: Tracks,
     frames: NDArray[np.int32],
     cameras: Sequence[pycolmap.Camera],
@@ -53,16 +52,16 @@ def sightings_of(
     """Collect the observations, in frames without a pose, of the points of tracks.
 
     Args:
-        points: triangulated points of `seen`.
-        seen: the tracks in the frames with known poses, from `Tracks.keep_frames`.
+        known: the tracks in the frames with known poses, and their points.
         tracks: the same tracks in all frames.
         frames: int32 [num_images] ascending frames without a pose.
         cameras: the pycolmap.Camera of each of these frames.
     """
     number = tracks.track
-    known = np.zeros(tracks.num_frames, dtype=np.bool_)
-    known[seen.frame] = True
-    in_seen = np.unique(number[known[tracks.frame]])
+    points, seen = known.points, known.tracks
+    is_known = np.zeros(tracks.num_frames, dtype=np.bool_)
+    is_known[seen.frame] = True
+    in_seen = np.unique(number[is_known[tracks.frame]])
     # A track that slid from one surface to another may have two points: the first is used.
     first = points.observation[points.offsets[:-1]]
     own, index = np.unique(np.searchsorted(seen.offsets, first, side="right"), return_index=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -56,12 +56,6 @@ def chaining_for_points(
     return options
 
 
-def seen_in(tracks: Tracks, frames: NDArray[np.int32]) -> tuple[Tracks, Ints]:
-    """The tracks restricted to some frames, and the index into `frames` of each observation."""
-    seen = tracks.keep_frames(frames)
-    return seen, indices_in(frames, tracks.num_frames)[seen.frame].astype(np.int64)
-
-
 def tracks_of_points(
     points: ModelPoints, frames: NDArray[np.int32], num_frames: int, size: tuple[int, int]
 ) -> Tracks:
@@ -86,42 +80,77 @@ def tracks_of_points(
     )
 
 
+@dataclass(frozen=True)
+class TriangulatedTracks:
+    """Tracks in some images, and the points triangulated from them.
+
+    Attributes:
+        tracks: the observations of the tracks in these images.
+        view: int64 [num_observations] index of the image of each.
+        rays: float64 [num_observations, 2] their undistorted positions, see `rays_of`.
+        points: the points, with indices of these observations.
+    """
+
+    tracks: Tracks
+    view: Ints
+    rays: Floats
+    points: TriangulatedPoints
+
+    @property
+    def agreement(self) -> float:
+        """The share of the tracks that agree with the poses."""
+        return self.points.num_agreeing / max(self.points.num_tracks, 1)
+
+    def model_points(self, xy: Floats | None = None) -> ModelPoints:
+        """The points as black model points.
+
+        Args:
+            xy: float64 [n, 2] the pixels of the points' observations; None: as in the tracks.
+        """
+        points, of_points = self.points, self.points.observation
+        if xy is None:
+            xy = self.tracks.xy[of_points].astype(np.float64)
+        black = np.zeros((len(points.xyz), 3), np.uint8)
+        image = self.view[of_points]
+        return ModelPoints(points.xyz, black, points.error, points.offsets, image, xy)
+
+
 def triangulate_tracks(
     tracks: Tracks,
-    view: Ints,
+    frames: NDArray[np.int32],
     views: Sequence[PosedCamera],
     *,
     options: TriangulateOptions,
     num_threads: int | None,
     pinholes: Sequence[pycolmap.Camera] | None = None,
-    rays: Floats | None = None,
     progress: Progress = no_progress,
-) -> TriangulatedPoints:
+) -> TriangulatedTracks:
     """Triangulate all tracks as `options.points` requests.
 
     Args:
         tracks: the tracks.
-        view: int64 [num_observations] the image of each observation.
+        frames: int32 [num_images] the frame of each image.
         views: the images.
         options: which points.
         num_threads: number of threads; None: one per CPU.
         pinholes: pinhole cameras in whose pixels errors are measured; None: pinhole cameras with
             the focal lengths of the images' own, see `fitting_in_images`.
-        rays: the result of `rays_of` if already known.
         progress: called with the stage "points".
     """
+    seen = tracks.keep_frames(frames)
+    view = indices_in(frames, tracks.num_frames)[seen.frame].astype(np.int64)
     cameras = [own.camera for own in views]
-    rays = rays_of(tracks, view, cameras) if rays is None else rays
+    rays = rays_of(seen, view, cameras)
     shown = cameras if pinholes is None else pinholes
     focal = np.array([[c.focal_length_x, c.focal_length_y] for c in shown])
-    num_tracks = tracks.num_tracks
-    return (splat_points if options.points == "splats" else triangulate)(
-        Observations(tracks.offsets, view, rays, tracks.sigma),
+    points = (splat_points if options.points == "splats" else triangulate)(
+        Observations(seen.offsets, view, rays, seen.sigma),
         Views(np.stack([own.cam_from_world for own in views]), focal),
         options,
         num_threads=num_threads,
-        progress=lambda done: progress("points", done, num_tracks),
+        progress=lambda done: progress("points", done, seen.num_tracks),
     )
+    return TriangulatedTracks(seen, view, rays, points)
 
 
 def rays_of(tracks: Tracks, view: Ints, cameras: Sequence[pycolmap.Camera]) -> Floats:
@@ -216,22 +245,3 @@ def fitting_in_images(
         apart[own] = np.linalg.norm(at - points.xy[own], axis=1)
     error = np.bincount(point, apart, len(lengths)) / lengths
     return replace(points, error=error).take(np.flatnonzero(error <= max_error))
-
-
-def to_model_points(
-    points: TriangulatedPoints, view: Ints, tracks: Tracks, xy: Floats | None = None
-) -> ModelPoints:
-    """Convert to black model points.
-
-    Args:
-        points: the points.
-        view: int64 [num_observations] the image of each observation of the tracks.
-        tracks: the tracks that were triangulated.
-        xy: float64 [n, 2] the pixels of the points' observations; None: as in the tracks.
-    """
-    if xy is None:
-        xy = tracks.xy[points.observation].astype(np.float64)
-    black = np.zeros((len(points.xyz), 3), np.uint8)
-    return ModelPoints(
-        points.xyz, black, points.error, points.offsets, view[points.observation], xy
-    )

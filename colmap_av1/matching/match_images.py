@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -34,13 +33,11 @@ class SelectedTracks:
     """The tracks of a video along which its images are matched.
 
     Attributes:
-        path: path of the video, for messages.
         tracks: the selected tracks.
         inter_share: float32 [num_frames], see `TrackedVideo`.
         fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
     """
 
-    path: Path
     tracks: Tracks
     inter_share: NDArray[np.float32]
     fast: Bools
@@ -97,7 +94,7 @@ def match_images(
     Raises:
         VideoError: nothing connects any two images.
     """
-    paired = pair_videos(image_set, videos, options, context)
+    paired = pair_videos(image_set, videos, options, context, name)
     made = cameras(paired)
     matched = verify_images(paired, made.of_images, options.verify, context)
     linked = link_images(
@@ -135,6 +132,7 @@ def pair_videos(
     videos: Sequence[SelectedTracks],
     options: MatchOptions,
     context: RunContext,
+    name: str,
 ) -> PairedImages:
     """Match the images of each video along its tracks, see `match_images`."""
     paired = []
@@ -150,7 +148,7 @@ def pair_videos(
         )
         paired.append(
             pair_images(
-                video.path,
+                name,
                 video.tracks,
                 chosen,
                 options.pairs,

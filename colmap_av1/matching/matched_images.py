@@ -66,7 +66,7 @@ class MatchedImages(PairedImages):
 
 
 def pair_images(
-    video: Path,
+    name: str,
     tracks: Tracks,
     chosen: ChosenImages,
     options: PairOptions,
@@ -78,7 +78,7 @@ def pair_images(
     """Match the images of a video along its tracks.
 
     Args:
-        video: path of the video, for messages.
+        name: name of the video in messages.
         tracks: tracks of the whole video.
         chosen: the images.
         options: which images are paired.
@@ -95,11 +95,11 @@ def pair_images(
         if needed and tracks.num_frames < min_length:
             shorter = ", or --min_length 2" if tracks.num_frames > 2 else ""
             raise VideoError(
-                f"{video}: the video has {tracks.num_frames} frames, a track needs {min_length}: "
+                f"{name}: the video has {tracks.num_frames} frames, a track needs {min_length}: "
                 f"give a longer video{shorter}"
             )
         if needed and len(pairs) == 0:
-            raise nothing_to_match(video, options)
+            raise nothing_to_match(name, options)
         matches = []
         for i, j in pairs:
             matches.append(pair_matches(keypoints[i], keypoints[j]))

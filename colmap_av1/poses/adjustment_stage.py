@@ -10,7 +10,6 @@ from colmap_av1.geometry.cameras import has_long_focal_length
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
-from colmap_av1.geometry.track_points import to_model_points
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.adjusting import adjust_posed, refines_intrinsics, without_unseen_images
@@ -183,5 +182,4 @@ def _triangulated_points(
     run: Run, registered: PosedImages, tracks: Tracks, options: TriangulateOptions
 ) -> ModelPoints:
     """Triangulated points of tracks in the registered images, without colours."""
-    seen, view, points = triangulate_in(run, registered, tracks, options)
-    return to_model_points(points, view, seen)
+    return triangulate_in(run, registered, tracks, options).model_points()

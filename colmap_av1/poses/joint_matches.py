@@ -140,7 +140,8 @@ def match_jointly(
     if density.max_sigma is None:
         density = replace(density, max_sigma=0.0)  # the poses show which tracks have drifted
     posed = estimate_poses(run, videos, image_set)
-    far = posed.long_range.result if posed.long_range is not None else None
+    assert posed.long_range is not None
+    long_range = posed.long_range.result
     models = [_model_of(run, posed, image_set)]
     # A second mapping would join images across turns, which the mapper of the database then bends.
     lost = set[str]()
@@ -174,7 +175,7 @@ def match_jointly(
         run, image_set, [(m.known, {i.name for i in m.registered.images}) for m in models]
     )
     matched = verify_images(paired, cameras, run.options.match.verify, run.context)
-    warnings = _warnings(far, models, not_registered, others, image_set)
+    warnings = _warnings(long_range, models, not_registered, others, image_set)
     if first.adjusted.seams_warning is not None:
         warnings.append(first.adjusted.seams_warning)
     matches = posed.matches.result
@@ -195,8 +196,8 @@ def match_jointly(
         warnings=(*matches.warnings, *warnings),
         estimate=JointEstimate(
             num_registered=tuple(len(model.registered.images) for model in models),
-            long_range=far.median if far is not None else None,
-            long_range_largest=far.largest if far is not None else None,
+            long_range=long_range.median,
+            long_range_largest=long_range.largest,
             dynamic_share=posed.dynamic.result.share if posed.dynamic is not None else None,
             focal_lengths=(min(focal), max(focal)),
         ),
@@ -307,8 +308,9 @@ def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, Float
 
 def _agreeing_motion(run: Run, tracks: Tracks, registered: PosedImages) -> tuple[Tracks, Floats]:
     """Motion tracks that have a point, without outliers, and their points."""
-    seen, _, points = triangulate_in(run, registered, tracks, _POINTS)
-    return seen.take(points.observation, points.offsets), points.xyz
+    found = triangulate_in(run, registered, tracks, _POINTS)
+    points = found.points
+    return found.tracks.take(points.observation, points.offsets), points.xyz
 
 
 def _start(tracks: Tracks, points: Floats, registered: PosedImages) -> InitialPair | None:
@@ -386,7 +388,7 @@ def _focal_length(run: Run, camera: pycolmap.Camera) -> float | None:
 
 
 def _warnings(
-    far: LongRangeResult | None,
+    long_range: LongRangeResult,
     models: Sequence[_Model],
     not_registered: Sequence[str],
     others: Tracks,
@@ -395,15 +397,15 @@ def _warnings(
     """Warnings about the estimate.
 
     Args:
-        far: result of the long-range check of the first model; None without one.
+        long_range: result of the long-range check of the first model.
         models: the models.
         not_registered: names of the images that are not registered.
         others: the tracks by which images are matched that are not registered.
         image_set: all images.
     """
     warnings = []
-    if far is not None and far.contradicts_poses and far.warning is not None:
-        warnings.append(far.warning)
+    if long_range.contradicts_poses and long_range.warning is not None:
+        warnings.append(long_range.warning)
     if len(models) > 1:
         parts = ", ".join(
             f"{len(images)} from '{images[0].name}' to '{images[-1].name}'"

@@ -114,7 +114,6 @@ def _compared(
 def _points_by_image(run: Run, tracks: Tracks, registered: PosedImages) -> list[Floats]:
     """Float64 [n, 3] some points that each image observes."""
     some = tracks.every_nth(max(1, tracks.num_tracks // _NUM_TRACKS))
-    _, view, points = triangulate_in(run, registered, pose_tracks(run, some), FOR_POSES)
-    xyz = np.repeat(points.xyz, np.diff(points.offsets), axis=0)
-    order, bounds = grouped(view[points.observation], len(registered.images))
-    return np.split(xyz[order], bounds[1:-1])
+    points = triangulate_in(run, registered, pose_tracks(run, some), FOR_POSES).model_points()
+    order, bounds = grouped(points.image, len(registered.images))
+    return np.split(points.xyz[points.point[order]], bounds[1:-1])

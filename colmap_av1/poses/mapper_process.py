@@ -73,8 +73,6 @@ def run_mapping(settings: dict[str, Any], on_image: Callable[[], None] | None = 
     each.mkdir()
     if settings["mapper"] == "incremental":
         how = _incremental_options(settings)
-        how.mapper.abs_pose_refine_focal_length = refine
-        how.mapper.abs_pose_refine_extra_params = refine
         if settings["tolerance"] is not None:
             how.ba_global_function_tolerance = settings["tolerance"]
         if settings["growth"] is not None:

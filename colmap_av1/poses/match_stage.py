@@ -191,8 +191,7 @@ def _selected_tracks(
         with run.clock.measure("pairs"):
             tracks = pose_tracks(run, own.tracks)
             sparse = select_tracks(tracks.keep_frames(image_set.of_video(video).frames), density)
-        path = run.shown[video].video.path
-        selected.append(SelectedTracks(path, sparse, own.inter_share, own.fast))
+        selected.append(SelectedTracks(sparse, own.inter_share, own.fast))
     return selected
 
 
@@ -217,7 +216,8 @@ def _match_images(
         shown, photos = run.shown, run.inputs.photos
         if camera.camera_params is not None or len(index) == len(image_set.sequence):
             return new_cameras(paired, keyed, shown, photos, camera, context=context)
-        every = pair_videos(image_set, _selected_tracks(run, videos, image_set), options, context)
+        selected = _selected_tracks(run, videos, image_set)
+        every = pair_videos(image_set, selected, options, context, run.inputs.name)
         made = new_cameras(every, image_set, shown, photos, camera, context=context)
         return replace(made, of_images=[made.of_images[i] for i in index])
 

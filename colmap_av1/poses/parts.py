@@ -131,12 +131,12 @@ def _parts_stage(
     name: str,
     key: Sequence[Any] = (),
 ) -> Kept[MappedResult]:
-    """Write the parts of an adjusted model, see `split_stage`.
+    """Write the parts of an adjusted model, which replace it among the mapper's models.
 
     Args:
-        run: see `split_stage`.
-        mapped: see there.
-        adjusted: see there.
+        run: the run.
+        mapped: the mapper's models.
+        adjusted: the adjusted model.
         parts_of_model: returns the names of the images of each part.
         name: name of the stage.
         key: what the parts depend on in addition to the model.
@@ -267,13 +267,18 @@ def _common_points(
         int64 [num_stretches, num_stretches] all of these points, and those that have depth in each
         stretch.
     """
+    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
+
     of_image = np.array([stretch_of[image.name] for image in model.images])
     point, stretch, has_depth = _seen_in_stretches(model, of_image)
     shape = (len(model.points.xyz), num_stretches)
-    return (
-        _common(point, stretch, shape),
-        _common(point[has_depth], stretch[has_depth], shape),
-    )
+
+    def common(some: Bools) -> Ints:
+        seen = (point[some], stretch[some])
+        sees = coo_array((np.ones(len(seen[0]), np.int64), seen), shape=shape).tocsr()
+        return np.asarray((sees.T @ sees).toarray())
+
+    return common(np.ones_like(has_depth)), common(has_depth)
 
 
 def _seen_in_stretches(model: PosedModel, of_image: Ints) -> tuple[Ints, Ints, Bools]:
@@ -300,20 +305,3 @@ def _seen_in_stretches(model: PosedModel, of_image: Ints) -> tuple[Ints, Ints, B
     has_depth = np.zeros(len(pair), np.bool_)
     has_depth[visit[angle >= least]] = True
     return pair // num_stretches, pair % num_stretches, has_depth
-
-
-def _common(point: Ints, stretch: Ints, shape: tuple[int, int]) -> Ints:
-    """The number of points that every two stretches have in common.
-
-    Args:
-        point: int64 [n] a point.
-        stretch: int64 [n] a stretch that sees it.
-        shape: number of points and of stretches.
-
-    Returns:
-        int64 [num_stretches, num_stretches]; the diagonal counts the points of each stretch.
-    """
-    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
-
-    sees = coo_array((np.ones(len(point), np.int64), (point, stretch)), shape=shape).tocsr()
-    return np.asarray((sees.T @ sees).toarray())

@@ -11,11 +11,15 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import ModelImage
-from colmap_av1.geometry.coverage import PosedCamera
+from colmap_av1.geometry.coverage import (
+    views_of,
+)
 from colmap_av1.geometry.masks import Mask, joined_masks
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model
-from colmap_av1.geometry.track_points import seen_in, triangulate_tracks
-from colmap_av1.geometry.triangulation import TriangulatedPoints
+from colmap_av1.geometry.track_points import (
+    TriangulatedTracks,
+    triangulate_tracks,
+)
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import TriangulateOptions
 from colmap_av1.poses.run import Run
@@ -100,22 +104,15 @@ def posed_images_of(poses: PosedModel, image_set: ImageSet) -> PosedImages:
 
 def triangulate_in(
     run: Run, registered: PosedImages, tracks: Tracks, options: TriangulateOptions
-) -> tuple[Tracks, Ints, TriangulatedPoints]:
-    """Triangulate tracks in the registered images.
-
-    Returns:
-        The observations of the tracks in these images; int64 [num_observations] the index of the
-        image of each; and the points, see `triangulate_tracks`.
-    """
-    seen, view = seen_in(tracks, registered.frames)
-    points = triangulate_tracks(
-        seen,
-        view,
-        [PosedCamera(registered.cameras[i.camera_id], i.cam_from_world) for i in registered.images],
+) -> TriangulatedTracks:
+    """Triangulate tracks in the registered images."""
+    return triangulate_tracks(
+        tracks,
+        registered.frames,
+        views_of(registered.images, registered.cameras),
         options=options,
         num_threads=run.context.num_threads,
     )
-    return seen, view, points
 
 
 def check_agreement(num_points: int, num_tracks: int) -> None:

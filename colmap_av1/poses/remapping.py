@@ -31,7 +31,6 @@ from colmap_av1.geometry.posed_model import (
     reprojection_errors,
     write_posed_model,
 )
-from colmap_av1.geometry.track_points import to_model_points
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.matched_images import verify_images
 from colmap_av1.matching.pairs import covisible_pairs
@@ -224,14 +223,14 @@ def _costs(
     """
     registered = posed_images_of(found, image_set)
     in_both = np.isin(tracks.frame, registered.frames)
-    seen, view, agreeing = triangulate_in(run, registered, tracks, FROM_PICTURES)
-    if len(agreeing.xyz) == 0:
+    triangulated = triangulate_in(run, registered, tracks, FROM_PICTURES)
+    points, agreeing = triangulated.model_points(), triangulated.points.observation
+    if len(points.xyz) == 0:
         return 0.0, 0.0, 0.0
-    points = to_model_points(agreeing, view, seen)
     adjusted = adjust_posed(run, PosedModel(registered.cameras, registered.images, points)).model
-    known_errors = reprojection_errors(known)[in_both][agreeing.observation]
+    known_errors = reprojection_errors(known)[in_both][agreeing]
     return (
-        len(agreeing.observation) / len(view),
+        len(agreeing) / len(triangulated.view),
         mean_cost(known_errors),
         mean_cost(reprojection_errors(adjusted)),
     )

@@ -60,8 +60,8 @@ def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -
     """The key images with a pose, and the images between them that get one."""
     seen_thrice = pose_tracks(run, tracks).keep_observed_in(known.frames, _FEWEST_VIEWS)
     spread = select_tracks(seen_thrice.keep_frames(image_set.images.frames), _RESECTED)
-    seen, _, points = triangulate_in(run, known, spread, FOR_POSES)
-    check_agreement(len(points.xyz), points.num_tracks)
+    with_points = triangulate_in(run, known, spread, FOR_POSES)
+    check_agreement(len(with_points.points.xyz), with_points.points.num_tracks)
     pose_of = {
         frame: (image.camera_id, image.cam_from_world)
         for frame, image in zip(known.frames.tolist(), known.images, strict=True)
@@ -82,7 +82,7 @@ def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -
             np.array([known.images[i].cam_from_world for i in own]), frames, left
         )
         found = resect(
-            sightings_of(points, seen, spread, left, cameras),
+            sightings_of(with_points, spread, left, cameras),
             guesses,
             np.array([camera.mean_focal_length() for camera in cameras]),
             seed=run.context.seed,

@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, writing
 from colmap_av1.geometry.colmap_model import camera_centres, model_points, posed_images, read_model
-from colmap_av1.geometry.coverage import PosedCamera
+from colmap_av1.geometry.coverage import (
+    PosedCamera,
+    views_of,
+)
 from colmap_av1.geometry.distant_points import distance_uncertainty
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.util.arrays import Floats
@@ -241,7 +244,7 @@ def write_model_gaussians(path: Path, model: Path) -> None:
     reconstruction = read_model(model)
     posed = sorted(posed_images(reconstruction).values(), key=lambda image: image.name)
     cameras = reconstruction.cameras
-    views = [PosedCamera(cameras[i.camera_id], i.cam_from_world) for i in posed]
+    views = views_of(posed, dict(cameras))
     write_gaussians(path, initial_gaussians(model_points(reconstruction, posed), views))
 
 

@@ -13,16 +13,17 @@ import pycolmap
 
 from colmap_av1.geometry.cameras import is_undistorted
 from colmap_av1.geometry.colmap_model import ModelImage, write_model
-from colmap_av1.geometry.coverage import PosedCamera, coverage, views_of
+from colmap_av1.geometry.coverage import (
+    PosedCamera,
+    coverage,
+    views_of,
+)
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.track_points import (
     Colours,
     fitting_in_images,
     mean_error,
-    rays_of,
-    seen_in,
-    to_model_points,
     triangulate_tracks,
 )
 from colmap_av1.geometry.undistortion import (
@@ -61,27 +62,23 @@ def _tracked_points(
     Returns:
         The points, and the share of the tracks that agree with the poses.
     """
-    seen, view = seen_in(tracks, registered.frames)
-    rays = rays_of(seen, view, registered.camera_of_image)
     cameras = [own.camera for own in views]
-    points = triangulate_tracks(
-        seen,
-        view,
-        [PosedCamera(registered.cameras[i.camera_id], i.cam_from_world) for i in registered.images],
+    found = triangulate_tracks(
+        tracks,
+        registered.frames,
+        views_of(registered.images, registered.cameras),
         options=run.options.triangulate,
         num_threads=run.context.num_threads,
         pinholes=cameras,
-        rays=rays,
         progress=run.progress,
     )
-    check_agreement(len(points.xyz), points.num_tracks)
-    agreeing = points.num_agreeing / max(points.num_tracks, 1)
+    check_agreement(len(found.points.xyz), found.points.num_tracks)
     if run.options.undistort:
-        xy = on_pinholes(rays[points.observation], view[points.observation], cameras)
-        return to_model_points(points, view, seen, xy), agreeing
-    tracked = to_model_points(points, view, seen)
+        of_points = found.points.observation
+        xy = on_pinholes(found.rays[of_points], found.view[of_points], cameras)
+        return found.model_points(xy), found.agreement
     most = run.options.triangulate.max_reprojection_error
-    return fitting_in_images(tracked, views, most), agreeing
+    return fitting_in_images(found.model_points(), views, most), found.agreement
 
 
 # Returns the undistortion of an image, given by its index; None if it is written unchanged.

@@ -46,7 +46,7 @@ _SPREAD = DensityOptions(preset="sparse", max_tracks_per_image=2000, spacing=10.
 def refine_tracks(
     tracks: Tracks,
     frames: Iterable[tuple[int, NDArray[np.uint8]]],
-    options: RefineOptions = RefineOptions(),
+    options: RefineOptions,
     progress: Callable[[int], None] | None = None,
     *,
     expected: Bools | None = None,
@@ -69,7 +69,7 @@ def refine_tracks(
         frames: (frame number, picture) of the frames in display order, uint8 BGR
             [height, width, 3] or grey [height, width]. Observations in frames that are
             missing keep the bitstream's step.
-        options: how to refine.
+        options: how to refine; `refine` is "lk".
         progress: called after each frame with the number of frames so far.
         expected: bool [num_observations] observations that are only predicted, not observed;
             None: none. If such an observation is not found, the picture around it is not used to
@@ -77,14 +77,11 @@ def refine_tracks(
 
     Returns:
         The same tracks and observations with corrected positions, their expected errors and
-        which of them are confirmed; the same object with `refine` "none", without reading
-        frames.
+        which of them are confirmed.
 
     Raises:
         ImageError: a picture differs in size from the tracks' frames, or comes out of order.
     """
-    if options.refine == "none":
-        return tracks
     state = RefinedTracks.start(tracks, options, expected)
     state.refine_all(frames, progress)
     return replace(

@@ -6,6 +6,7 @@ import pytest
 
 from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.resection import Sightings, interpolate_poses, resect, sightings_of
+from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.tracks.tracks import Tracks
 
@@ -84,7 +85,8 @@ def test_sightings_come_from_tracks_with_points(wanted: tuple[int, ...]) -> None
         np.array([[1.0, 2, 3], [4, 5, 6]]), np.zeros(2), np.array([0, 3, 5]), np.arange(5), 2, 2
     )
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=100, height=80, params=[50.0, 0, 0])
-    found = sightings_of(points, seen, tracks, np.array(wanted, np.int32), [camera] * len(wanted))
+    known = TriangulatedTracks(seen, seen.frame // 2, np.zeros(seen.xy.shape), points)
+    found = sightings_of(known, tracks, np.array(wanted, np.int32), [camera] * len(wanted))
     rows = {1: [1, 7], 3: [3, 9]}
     np.testing.assert_array_equal(found.bounds, 2 * np.arange(len(wanted) + 1))
     expected = [row for f in wanted for row in rows[f]]

@@ -10,9 +10,8 @@ from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.track_points import (
     Colours,
+    TriangulatedTracks,
     chaining_for_points,
-    seen_in,
-    to_model_points,
     triangulate_tracks,
 )
 from colmap_av1.geometry.triangulation import TriangulatedPoints
@@ -75,10 +74,22 @@ def test_chaining_for_points_keeps_short_tracks(
 
 def test_views_are_indices_of_the_given_frames() -> None:
     tracks = make_tracks(np.arange(2 * 6 * 2.0).reshape(2, 6, 2))
-    seen, view = seen_in(tracks, np.array([1, 4, 5], dtype=np.int32))
-    assert seen.frame.tolist() == [1, 4, 5, 1, 4, 5]
-    assert view.tolist() == [0, 1, 2, 0, 1, 2]
-    np.testing.assert_array_equal(seen.xy, tracks.xy[[1, 4, 5, 7, 10, 11]])
+    frames = np.array([1, 4, 5], dtype=np.int32)
+    views = [PosedCamera(PLAIN, POSES[frame]) for frame in frames]
+    found = triangulate_tracks(tracks, frames, views, options=TriangulateOptions(), num_threads=1)
+    assert found.tracks.frame.tolist() == [1, 4, 5, 1, 4, 5]
+    assert found.view.tolist() == [0, 1, 2, 0, 1, 2]
+    np.testing.assert_array_equal(found.tracks.xy, tracks.xy[[1, 4, 5, 7, 10, 11]])
+
+
+def test_tracks_outside_the_images_give_no_points() -> None:
+    tracks = make_tracks(np.zeros((2, 6, 2))).keep_frames(np.array([0], np.int32))
+    views = [PosedCamera(PLAIN, POSES[k]) for k in (1, 2)]
+    found = triangulate_tracks(
+        tracks, np.array([1, 2], np.int32), views, options=TriangulateOptions(), num_threads=1
+    )
+    assert len(found.view) == len(found.model_points().xyz) == 0
+    assert found.agreement == 0
 
 
 def test_points_are_triangulated_from_several_cameras() -> None:
@@ -93,22 +104,21 @@ def test_points_are_triangulated_from_several_cameras() -> None:
         axis=1,
     )
     tracks = make_tracks(xy)
-    seen, view = seen_in(tracks, np.arange(6, dtype=np.int32))
 
     def found(pinhole: pycolmap.Camera | None, xy: np.ndarray) -> TriangulatedPoints:
         return triangulate_tracks(
-            replace(seen, xy=xy),
-            view,
+            replace(tracks, xy=xy),
+            np.arange(6, dtype=np.int32),
             [PosedCamera(camera, pose) for camera, pose in zip(cameras, POSES, strict=True)],
             options=TriangulateOptions(),
             num_threads=1,
             pinholes=pinhole and [pinhole] * len(cameras),
-        )
+        ).points
 
-    exact = found(None, seen.xy)
+    exact = found(None, tracks.xy)
     np.testing.assert_allclose(exact.xyz, truth, rtol=1e-4)
     # Errors are in pixels of the given camera.
-    noisy = seen.xy + rng.normal(0, 0.2, seen.xy.shape).astype(np.float32)
+    noisy = tracks.xy + rng.normal(0, 0.2, tracks.xy.shape).astype(np.float32)
     wide = pycolmap.Camera(
         camera_id=9, model="PINHOLE", width=WIDTH, height=HEIGHT, params=[50, 50, 320, 240]
     )
@@ -143,7 +153,8 @@ def test_model_points_list_the_images_that_observe_them() -> None:
     points = make_points([[4, 1], [0, 3, 5]])
     view = np.array([0, 1, 2, 0, 1, 2])
     xy = np.arange(10.0).reshape(5, 2)
-    made = to_model_points(points, view, make_tracks(np.zeros((1, 6, 2))), xy)
+    tracks = make_tracks(np.zeros((1, 6, 2)))
+    made = TriangulatedTracks(tracks, view, np.zeros((6, 2)), points).model_points(xy)
     assert made.image.tolist() == [1, 1, 0, 0, 2]
     assert made.offsets.tolist() == [0, 2, 5]
     assert made.rgb.tolist() == [[0, 0, 0]] * 2

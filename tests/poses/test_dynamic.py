@@ -23,6 +23,7 @@ from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, make_mask
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.geometry.triangulation import (
     Observations,
     TriangulatedPoints,
@@ -142,7 +143,8 @@ def made(velocity: tuple[float, float, float] | None, *, drift: float = 0.0) -> 
             max_reprojection_error=8.0, min_angle=0.0, max_depth_error=None, points="survey"
         ),
     )
-    in_cells = tracks_in_cells(tracks, image, points, views, cell=CELL)
+    triangulated = TriangulatedTracks(tracks, image, np.zeros_like(xy), points)
+    in_cells = tracks_in_cells(triangulated, views, CELL)
     return Made(in_cells, views, np.array(moves))
 
 
@@ -468,7 +470,8 @@ def test_points_are_expected_in_the_images_they_project_to() -> None:
     left_half = np.ones((HEIGHT, WIDTH), np.bool_)
     left_half[:, : WIDTH // 2] = False
     views = [replace(view, mask=make_mask(left_half)) for view in views]
-    found, expected = expect_in_views(tracks, image[kept], points, views, frames)
+    triangulated = TriangulatedTracks(tracks, image[kept], np.zeros((kept.sum(), 2)), points)
+    found, expected = expect_in_views(triangulated, views, frames)
     # Observations are kept, and each point is expected at its projection in later images, except
     # near the edge and on masks.
     np.testing.assert_array_equal(found.xy[~expected], tracks.xy)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import make_mask
+from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.patch_matching import match_patches
@@ -122,7 +123,9 @@ def look(scene: Scene, pictures: GreyPictures, views: list[PosedCamera] | None =
     """Match the corners of the scene."""
     seen: list[int] = []
     found = match_patches(
-        *(scene.corners, scene.view, scene.points),
+        TriangulatedTracks(
+            scene.corners, scene.view, np.zeros(scene.corners.xy.shape), scene.points
+        ),
         views=scene.views if views is None else views,
         frames=np.arange(len(POSES), dtype=np.int32),
         pictures=pictures,

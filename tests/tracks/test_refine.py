@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
 import pytest
@@ -162,15 +160,6 @@ def test_tracks_in_missing_frames_keep_their_motion() -> None:
     # Later frames find the template again.
     later = is_textured(tracks) & (tracks.frame == 8)
     assert np.median(np.linalg.norm((refined.xy - truth)[later], axis=1)) < 0.06
-
-
-def test_frames_are_not_read_without_refinement() -> None:
-    def frames() -> Any:
-        pytest.fail("read")
-        yield
-
-    tracks, _ = moving_tracks(0.3)
-    assert refine_tracks(tracks, frames(), RefineOptions(refine="none")) is tracks
 
 
 def test_threads_and_colour_do_not_change_the_result() -> None:

@@ -210,7 +210,7 @@ def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOpti
     context = RunContext.of(options.run)
     try:
         paired = pair_images(
-            video,
+            str(video),
             select_tracks(seen, DensityOptions(preset="sparse")),
             chosen,
             PairOptions(offsets=(1,), growth=1.0),

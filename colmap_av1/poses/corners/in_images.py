@@ -95,13 +95,11 @@ def _match_in_all(
     pictures: GreyPictures,
 ) -> Tracks:
     """Locate corners in all images that see them, see `match_patches`."""
-    seen, view, points = triangulate_in(run, registered, corners, FROM_PICTURES)
+    found = triangulate_in(run, registered, corners, FROM_PICTURES)
     views = views_of(registered.images, registered.cameras, masks)
     report = progress_in(run.progress, "refinement", len(views))
     return match_patches(
-        seen,
-        view,
-        points,
+        found,
         views=views,
         frames=registered.frames,
         pictures=pictures,
@@ -121,14 +119,14 @@ def resect_from_corners(run: Run, corners: Tracks, registered: PosedImages) -> P
         corners: corners as tracks.
         registered: the registered images.
     """
-    seen, _, points = triangulate_in(run, registered, corners, FROM_PICTURES)
-    if len(points.xyz) == 0:
+    found = triangulate_in(run, registered, corners, FROM_PICTURES)
+    if len(found.points.xyz) == 0:
         return registered
     images = list(registered.images)
     cameras = registered.camera_of_image
-    sightings = sightings_of(points, seen, seen, registered.frames, cameras)
+    sightings = sightings_of(found, found.tracks, registered.frames, cameras)
     focal = np.array([camera.mean_focal_length() for camera in cameras])
-    found = resect(
+    poses = resect(
         sightings,
         np.array([image.cam_from_world for image in images]),
         focal,
@@ -136,7 +134,7 @@ def resect_from_corners(run: Run, corners: Tracks, registered: PosedImages) -> P
         seed=run.context.seed,
         num_threads=run.context.num_threads,
     )
-    for i, pose in enumerate(found):
+    for i, pose in enumerate(poses):
         own = slice(int(sightings.bounds[i]), int(sightings.bounds[i + 1]))
         shown = sightings.rays[own] * focal[i], sightings.xyz[own], float(focal[i])
         if pose is not None and _error(*shown, pose) < _error(*shown, images[i].cam_from_world):

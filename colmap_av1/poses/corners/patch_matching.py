@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from colmap_av1 import _core
 from colmap_av1.geometry.coverage import PosedCamera
+from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.slopes import surface_slopes
@@ -77,9 +78,7 @@ class _Patches:
 
 
 def match_patches(
-    corners: Tracks,
-    view: Ints,
-    points: TriangulatedPoints,
+    corners: TriangulatedTracks,
     *,
     views: Sequence[PosedCamera],
     frames: NDArray[np.int32],
@@ -90,9 +89,7 @@ def match_patches(
     """Locate corners in all images that have a picture.
 
     Args:
-        corners: corners as tracks, in pixels of the images.
-        view: int64 [num_observations] image of each observation.
-        points: points of the corners.
+        corners: corners as tracks in pixels of the images, and their points.
         views: all images, with their poses and masks.
         frames: int32 [n] their frames.
         pictures: grey pictures of the images, which may be downscaled.
@@ -104,8 +101,10 @@ def match_patches(
         the patch is cut, and the matches in other images. Images with few matches keep the
         followed corners.
     """
+    tracks, points = corners.tracks, corners.points
     point = points.point
-    image, xy = view[points.observation], corners.xy[points.observation].astype(np.float64)
+    image = corners.view[points.observation]
+    xy = tracks.xy[points.observation].astype(np.float64)
     middle = (points.offsets[:-1] + points.offsets[1:]) // 2
     by_image, bounds = grouped(image, len(views))
     patches = _cut(points, middle, image, xy, views=views, pictures=pictures)
@@ -127,8 +126,8 @@ def match_patches(
         found.append(matches)
         progress(done)
     own, image, at = (np.concatenate(column) for column in zip(*found, strict=True))
-    sigma = float(corners.sigma.max(initial=0.0))
-    return corners.of_observations(own, frames[image], at, sigma, min_length=_MIN_IMAGES)
+    sigma = float(tracks.sigma.max(initial=0.0))
+    return tracks.of_observations(own, frames[image], at, sigma, min_length=_MIN_IMAGES)
 
 
 def _cut(
@@ -266,7 +265,7 @@ def _in_view(
     # The patch must cover the window.
     farthest = np.abs(change).sum(axis=2).max(axis=1, initial=0.0) * (_WINDOW // 2)
     kept = np.flatnonzero(farthest <= _PATCH // 2 - 1)
-    kept = kept[evenly_spread(len(kept), _MAX_POINTS)] if len(kept) else kept
+    kept = kept[evenly_spread(len(kept), _MAX_POINTS)]
     return index[kept], at[kept], change[kept]
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.geometry.coverage import PosedCamera
-from colmap_av1.geometry.triangulation import SIGMA_FLOOR, TriangulatedPoints
-from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.geometry.track_points import TriangulatedTracks
+from colmap_av1.geometry.triangulation import SIGMA_FLOOR
 from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.threads import map_on_threads
@@ -106,22 +106,17 @@ class TracksInCells:
 
 
 def tracks_in_cells(
-    tracks: Tracks,
-    image: Ints,
-    points: TriangulatedPoints,
-    views: Sequence[PosedCamera],
-    *,
-    cell: int,
+    triangulated: TriangulatedTracks, views: Sequence[PosedCamera], cell: int
 ) -> TracksInCells:
     """Compute the residuals, depths and cells of tracks.
 
     Args:
-        tracks: tracks in some images of one size.
-        image: int64 [num_observations] the image of each observation.
-        points: their points; for a track with several, the one with the most inliers is used.
+        triangulated: tracks in some images of one size; for a track with several points, the one
+            with the most inliers is used.
         views: the images.
         cell: width of a cell in pixels.
     """
+    tracks, image, points = triangulated.tracks, triangulated.view, triangulated.points
     offsets = tracks.offsets
     track = tracks.track
     xyz = np.full((tracks.num_tracks, 3), np.nan)

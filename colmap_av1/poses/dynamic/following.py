@@ -14,15 +14,17 @@ from numpy.typing import NDArray
 
 from colmap_av1.geometry.coverage import PosedCamera, views_of
 from colmap_av1.geometry.masks import Mask
-from colmap_av1.geometry.track_points import seen_in, triangulate_tracks
-from colmap_av1.geometry.triangulation import TriangulatedPoints
+from colmap_av1.geometry.track_points import (
+    TriangulatedTracks,
+    triangulate_tracks,
+)
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import RefineOptions
 from colmap_av1.poses.posed_images import FOR_POSES, PosedImages
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.arrays import Bools, Ints
+from colmap_av1.util.arrays import Bools
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.progress import progress_in
 
@@ -66,21 +68,18 @@ def follow_behind(
     for video in range(len(run.shown)):
         own = np.flatnonzero(registered.sequence == video)
         frames = registered.frames[own]
-        seen, view = seen_in(tracks, frames)
-        if len(view) == 0:
-            continue
         images = [registered.images[i] for i in own]
         views = views_of(images, registered.cameras, [masks[i] for i in own])
-        points = triangulate_tracks(
-            seen,
-            view,
+        triangulated = triangulate_tracks(
+            tracks,
+            frames,
             views,
             options=FOR_POSES,
             num_threads=run.context.num_threads,
         )
-        if len(points.xyz) == 0:  # the camera of this video stands still
+        if len(triangulated.points.xyz) == 0:  # The camera of this video stands still.
             continue
-        expected, is_expected = expect_in_views(seen, view, points, views, frames)
+        expected, is_expected = expect_in_views(triangulated, views, frames)
         first_frame = int(registered.first_frame[video])
         corrected = _on_pictures(run, video, expected, is_expected, first_frame)
         found = Tracks.concatenate(
@@ -106,18 +105,14 @@ def _on_pictures(run: Run, video: int, tracks: Tracks, expected: Bools, first_fr
 
 
 def expect_in_views(
-    tracks: Tracks,
-    view: Ints,
-    points: TriangulatedPoints,
+    triangulated: TriangulatedTracks,
     views: Sequence[PosedCamera],
     frames: NDArray[np.int32],
 ) -> tuple[Tracks, Bools]:
     """Points as tracks, with their projections into views between and after their observations.
 
     Args:
-        tracks: the tracks that the points come from.
-        view: int64 [num_observations] view of each observation.
-        points: the points.
+        triangulated: the points, and the tracks that they come from.
         views: images of one video with their masks, in temporal order.
         frames: int32 [num_views] their frames.
 
@@ -125,9 +120,10 @@ def expect_in_views(
         A track for each point, and bool [num_observations] which of its observations are
         projections.
     """
+    tracks, points = triangulated.tracks, triangulated.points
     num_points = len(points.xyz)
     point = points.point
-    seen_by = view[points.observation]
+    seen_by = triangulated.view[points.observation]
     first, last = seen_by[points.offsets[:-1]], seen_by[points.offsets[1:] - 1]
     by_view, bounds = grouped(seen_by, len(views))
     points_in, xy_in = [point], [tracks.xy[points.observation]]

@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from colmap_av1.geometry.coverage import views_of
 from colmap_av1.geometry.masks import Mask
-from colmap_av1.geometry.track_points import chaining_for_points, seen_in, triangulate_tracks
+from colmap_av1.geometry.track_points import (
+    chaining_for_points,
+    triangulate_tracks,
+)
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.masks import mask_tracks
 from colmap_av1.images.track_images import MIN_IMAGES
@@ -140,7 +143,7 @@ def _dynamic_masks(
     """Masks that exclude dynamic pixels from the images of a video, by image name."""
     num_threads = run.context.num_threads
     images = [registered.images[i] for i in own]
-    views = views_of(images, registered.cameras, [None] * len(own))
+    views = views_of(images, registered.cameras)
     size = views[0].size
     cell = _CELL * max(1, round(max(size) / _USUAL_WIDTH))
     spread = DensityOptions(
@@ -151,23 +154,21 @@ def _dynamic_masks(
         max_sigma=0.0,
         wide_tracks=0,
     )
-    seen, image = seen_in(
-        select_tracks(tracks.keep_frames(registered.frames[own]), spread), registered.frames[own]
-    )
-    if len(image) == 0:
-        return {}
+    frames = registered.frames[own]
     # The limits are loose, so that slightly drifting and slowly moving tracks get points too.
     how = TriangulateOptions(
         max_reprojection_error=float(cell), min_angle=0.0, max_depth_error=None, points="survey"
     )
-    points = triangulate_tracks(
-        seen,
-        image,
+    found = triangulate_tracks(
+        select_tracks(tracks.keep_frames(frames), spread),
+        frames,
         views,
         options=how,
         num_threads=num_threads,
     )
-    in_cells = tracks_in_cells(seen, image, points, views, cell=cell)
+    if len(found.view) == 0:
+        return {}
+    in_cells = tracks_in_cells(found, views, cell)
     cells = dynamic_cells(in_cells, views, num_threads=num_threads)
     return {
         own_image.name: mask_of_cells(dynamic, cell, size)
