@@ -265,13 +265,7 @@ def _pictures(
 ) -> Pictures:
     """A source of pictures in the size of the images; those of videos are kept in a folder."""
     shown = [
-        ShownVideo(
-            own.video,
-            own.shown.size,
-            own.shown.pixel_aspect,
-            own.shown.display,
-            KeptPictures(scratch / f"{number}.raw"),
-        )
+        ShownVideo(**vars(own.shown), video=own.video, kept=KeptPictures(scratch / f"{number}.raw"))
         for number, own in enumerate(of_videos)
     ]
     return pictures_of(image_set, shown, [photo.path for photo in photos], options.match.reading)

@@ -396,7 +396,7 @@ def _check_images_of_other_runs(
                     own.source.pictures,
                     own.tracked.tracks.num_frames,
                     options.reading,
-                    own.display,
+                    own.shown.display,
                     wanted=frames_near([frame]),
                 )
                 check_content([path], [frame], pictures)
@@ -423,8 +423,8 @@ class _Images:
     def shown(self) -> tuple[ShownVideo, ...]:
         """The videos, whose pictures are shown in the size of the images."""
         return tuple(
-            ShownVideo(v.source.pictures, v.size, v.pixel_aspect, v.display, v.source.kept)
-            for v in self.videos
+            ShownVideo(**vars(own.shown), video=own.source.pictures, kept=own.source.kept)
+            for own in self.videos
         )
 
 
@@ -644,7 +644,7 @@ def _correct_rolling_shutter(
     tracked = prepared.tracked
     corrected = correct_rolling_shutter(
         tracked.tracks,
-        prepared.display,
+        prepared.shown.display,
         prepared.source.pictures.frame_rate,
         options.camera,
         context,

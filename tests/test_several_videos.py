@@ -288,6 +288,22 @@ def test_database_of_other_images_is_an_error(halves: tuple[Path, Path], tmp_pat
         match(tmp_path / "a.db", halves, options=again)
 
 
+def test_database_of_photos_only_is_an_error(
+    halves: tuple[Path, Path], photos: Path, tmp_path: Path
+) -> None:
+    database = tmp_path / "a.db"
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=480, height=270, params=[400, 240, 135])
+    with pycolmap.Database.open(database) as made:
+        camera_id = made.write_camera(camera)
+        for photo in read_inputs(halves[0], photos, QUICK).photos:
+            made.write_image(pycolmap.Image(name=photo.name, camera_id=camera_id))
+    before = database.read_bytes()
+    for videos in (halves[0], halves):
+        with pytest.raises(DatabaseError, match="none of a video"):
+            match(database, videos, photos=photos, options=QUICK)
+    assert database.read_bytes() == before
+
+
 @pytest.mark.parametrize(
     ("places", "labels"),
     [

@@ -45,6 +45,11 @@ def listed_of_videos(
                 f"{database}: lists images, but not '{photo.name}': import it too, or use a new "
                 "database"
             )
+    if listed and not sizes:
+        raise DatabaseError(
+            f"{database}: lists images, but none of a video: import its images too, or use a new "
+            "database"
+        )
     if inputs.labels == ("",):
         return [sizes]
     for name, size in sizes.items():
@@ -57,7 +62,7 @@ def listed_of_videos(
             )
         of_videos[inputs.labels.index(label)][own] = size
     for label, found in zip(inputs.labels, of_videos, strict=True):
-        if sizes and not found:
+        if listed and not found:
             raise DatabaseError(
                 f"{database}: lists images, but none in folder '{label}': import that video's "
                 "images, or use a new database"
@@ -68,16 +73,9 @@ def listed_of_videos(
 def listed_cameras(
     database: Path, listed: Sequence[DatabaseImage], names: Sequence[str]
 ) -> list[pycolmap.Camera]:
-    """The cameras that the database holds for its images, one for each name.
-
-    Raises:
-        DatabaseError: the camera of an image is missing.
-    """
+    """The cameras that the database holds for its images, one for each name."""
     cameras = read_cameras(database)
     camera_id = {image.name: image.camera_id for image in listed}
-    missing = next((n for n in names if camera_id[n] not in cameras), None)
-    if missing is not None:
-        raise DatabaseError(f"{database}: image '{missing}' has no camera: import the images again")
     return [cameras[camera_id[name]] for name in names]
 
 

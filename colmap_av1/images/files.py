@@ -303,8 +303,7 @@ def _pictures(
                 f"{size[1]}x{size[0]}: images of one camera cannot change their size; "
                 "re-encode the video at one size"
             )
-        if index in wanted:
-            yield index, picture
+        yield index, picture
         if index >= last:
             return
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import read_image
+from colmap_av1.images.orientation import ShownImages
 from colmap_av1.options import ReadOptions
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.arrays import Ints, Picture
-from colmap_av1.video.display import Display
 from colmap_av1.video.facts import Video
 from colmap_av1.video.kept_pictures import KeptPictures
 
@@ -128,27 +128,21 @@ def count_through(
 
 
 @dataclass(frozen=True)
-class ShownVideo:
-    """A video and how its pictures are displayed in its images.
+class ShownVideo(ShownImages):
+    """A video and how its images show it; pictures of another size are resized.
 
     Attributes:
         video: the video.
-        size: (width, height) of the images in pixels; pictures of another size are resized.
-        pixel_aspect: width of the images' pixels over their height.
-        display: how pictures are cropped and rotated; None: as players do.
         kept: store of decoded pictures; None: pictures are decoded each time.
     """
 
     video: Video
-    size: tuple[int, int]
-    pixel_aspect: float
-    display: Display | None = None
     kept: KeptPictures | None = None
 
     @staticmethod
     def as_played(video: Video, kept: KeptPictures | None = None) -> ShownVideo:
         """The video with its pictures as players show them."""
-        return ShownVideo(video, video.picture_size, video.display.pixel_aspect, None, kept)
+        return ShownVideo(video.display, video.picture_size, video.picture_size, video, kept)
 
     def pictures(
         self, num_frames: int, options: ReadOptions, *, wanted: Collection[int], use: str

@@ -32,7 +32,7 @@ class ShownImages:
         """Width of the images' pixels over their height."""
         (width, height), (image_width, image_height) = self.video_size, self.size
         # Images may be scaled by different factors along x and y.
-        return self.display.pixel_aspect * width * image_height / (height * image_width)
+        return self.display.pixel_aspect * (width * image_height / (height * image_width))
 
 
 def shown_images(

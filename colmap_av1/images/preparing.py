@@ -17,7 +17,7 @@ from colmap_av1.images.files import (
 )
 from colmap_av1.images.masks import VideoMasks
 from colmap_av1.images.names import names_of_all
-from colmap_av1.images.orientation import shown_images
+from colmap_av1.images.orientation import ShownImages, shown_images
 from colmap_av1.images.recognising import check_content, frames_near
 from colmap_av1.images.track_images import (
     ImageChoice,
@@ -29,7 +29,6 @@ from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions, ReadOp
 from colmap_av1.tracks.video_tracks import VideoSource, open_source
 from colmap_av1.util.progress import Progress
 from colmap_av1.util.run_context import RunContext
-from colmap_av1.video.display import Display
 from colmap_av1.video.facts import Video, count_shown
 from colmap_av1.video.unchanged import unchanged
 
@@ -44,18 +43,14 @@ class PreparedImages:
 
     Attributes:
         source: the video; a stream that is not kept no longer exists.
-        display: how its pictures are shown in the images.
+        shown: how the images show it.
         tracked: the tracks, in pixels of the images, and the images.
-        size: (width, height) of the images.
-        pixel_aspect: width of the images' pixels over their height.
         existed: whether there were images, so that their names need not show the frames.
     """
 
     source: VideoSource
-    display: Display
+    shown: ShownImages
     tracked: TrackedImages
-    size: tuple[int, int]
-    pixel_aspect: float
     existed: bool
 
 
@@ -153,10 +148,8 @@ def prepare_images(
             check_content([folder / name for name in some], list(some.values()), pictures)
     return PreparedImages(
         source=source,
-        display=shown.display,
+        shown=shown,
         tracked=found.with_tracks(found.tracks.scale_to(size)),
-        size=size,
-        pixel_aspect=shown.pixel_aspect,
         existed=bool(existing),
     )
 
@@ -183,7 +176,7 @@ def write_prepared(
         chosen.frames.tolist(),
         num_threads=read.num_threads,
         operating_point=read.operating_point,
-        display=prepared.display,
+        display=prepared.shown.display,
         kept=prepared.source.kept,
         progress=lambda done: progress("images", done, len(chosen.names)),
     )

@@ -116,13 +116,10 @@ def read_info(
     """
     counts = _count(read_motion(video, options), progress)
     structure = counts.structure
-    if structure.num_shown > 0:
-        # Frames that are shown again are not coded frames, and a stream may end with them.
-        structure.num_shown = count_with_repeats(
-            first_showings(video, options), structure.num_shown
-        )
     if structure.num_shown == 0:
         raise VideoError(f"{video}: shows no frames: give another video")
+    # Frames that are shown again are not coded frames, and a stream may end with them.
+    structure.num_shown = count_with_repeats(first_showings(video, options), structure.num_shown)
     # The bitstream is read first because only its parser limits the frame size.
     opened = read_video(video)
     if opened.doubtful_times is not None:

@@ -117,8 +117,7 @@ def camera_of_model(
     if name not in models or name == "INVALID":
         known = ", ".join(n for n in models if n != "INVALID")
         raise OptionError(f"unknown camera model {name!r}: give one of {known}")
-    create = getattr(pycolmap.Camera, "create_from_model_id", None) or pycolmap.Camera.create
-    camera: pycolmap.Camera = create(0, models[name], focal_length, width, height)
+    camera = pycolmap.Camera.create_from_model_id(0, models[name], focal_length, width, height)
     if len(camera.focal_length_idxs()) == 0:
         raise OptionError(
             f"camera model {name} has no focal length: give a perspective or fisheye model such as "

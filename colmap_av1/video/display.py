@@ -37,8 +37,9 @@ class Display:
     def rotation(self) -> int:
         """The rotation in degrees counter-clockwise, without the reflection."""
         (a, b), _ = self.turn
-        turned = (1, 0) if a else (0, 1)
-        return {(1, 0): 0 if a > 0 else 180, (0, 1): 90 if b > 0 else 270}[turned]
+        if a:
+            return 0 if a > 0 else 180
+        return 90 if b > 0 else 270
 
     @property
     def is_mirrored(self) -> bool:

@@ -57,8 +57,8 @@ def test_no_picture_is_decoded_without_an_image_folder(clip: Path) -> None:
     assert "recognising" not in stages
     assert "decoding" not in clock.seconds
     assert found.tracked.chosen.names == image_names("frame_%06d.png", found.tracked.chosen.frames)
-    assert found.size == (192, 128)
-    assert found.pixel_aspect == 1.0
+    assert found.shown.size == (192, 128)
+    assert found.shown.pixel_aspect == 1.0
 
 
 def test_tracks_are_in_pixels_of_scaled_images(clip: Path, tmp_path: Path) -> None:
@@ -68,13 +68,13 @@ def test_tracks_are_in_pixels_of_scaled_images(clip: Path, tmp_path: Path) -> No
         small = cv2.resize(picture, (96, 63), interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(tmp_path / "images" / f"{index + 1}.png"), small)
     found = prepared(clip, tmp_path / "images")
-    assert found.size == (found.tracked.tracks.width, found.tracked.tracks.height) == (96, 63)
+    assert found.shown.size == (found.tracked.tracks.width, found.tracked.tracks.height) == (96, 63)
     assert found.tracked.chosen.names == [f"{i + 1}.png" for i in range(16)]
     factor = np.array([96 / 192, 63 / 128])
     in_video = prepared(clip).tracked.tracks
     np.testing.assert_allclose(found.tracked.tracks.xy, in_video.xy * factor, rtol=1e-6)
     # A pixel of the images is 2 video pixels wide and 128 / 63 high.
-    assert found.pixel_aspect == pytest.approx(2 / (128 / 63))
+    assert found.shown.pixel_aspect == pytest.approx(2 / (128 / 63))
     listed = {f"{i}.png": (96, 63) for i in range(16)}
     assert prepared(clip, listed=listed).size == (96, 63)
 

@@ -37,6 +37,7 @@ from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.encode import encode as encode_video
 from colmap_av1.video.encode import stream_of
 from colmap_av1.video.encoders import ENCODERS, find_encoder
+from colmap_av1.video.facts import read_video
 
 TO_A_FILE = ("encode", "--output", "out.mp4")
 TO_A_DATABASE = ("match", "--database", "a.db")
@@ -396,13 +397,16 @@ def test_video_whose_end_is_missing_is_used_with_a_warning(
     video = tmp_path / "cut.mkv"
     video.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     stream = tmp_path / "kept.mp4"
-    for _ in range(2):  # the stream is reused the second time
-        with pytest.warns(UserWarning, match="damaged"):
-            report = stream_of(video, stream)
-        assert 0 < report.num_frames < len(times(phone))
-    with pytest.raises(BitstreamError, match="cut off"):
-        encode_video(video, tmp_path / "strict.mp4", strict=True)
-    assert not (tmp_path / "strict.mp4").exists()
+    for given in (video, read_video(video)):
+        for _ in range(2):  # the stream is reused the second time
+            with pytest.warns(UserWarning, match="damaged"):
+                report = stream_of(given, stream)
+            assert 0 < report.num_frames < len(times(phone))
+        stream.unlink()
+        for make in (encode_video, stream_of):
+            with pytest.raises(BitstreamError, match="cut off"):
+                make(given, tmp_path / "strict.mp4", strict=True)
+            assert not (tmp_path / "strict.mp4").exists()
     # The last packet in coding order is not the last picture.
     slower = "setpts='if(gt(N,9),N*8,N)/25/TB'"
     varying = ["-i", phone, "-vf", slower, "-fps_mode", "vfr", "-c:v", "libx264", "-bf", "3"]

@@ -154,8 +154,8 @@ def choose_footage(
             names=chosen.names,
             frames=tuple(chosen.frames.tolist()),
             num_frames=prepared.tracked.tracks.num_frames,
-            size=prepared.size,
-            pixel_aspect=prepared.pixel_aspect,
+            size=prepared.shown.size,
+            pixel_aspect=prepared.shown.pixel_aspect,
             forward_motion=_is_forward_motion(prepared, video.path, options),
             warnings=prepared.tracked.video.warnings,
         )
@@ -206,7 +206,7 @@ def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOpti
     """Whether the camera moves along its optical axis."""
     tracks, chosen = prepared.tracked.tracks, prepared.tracked.chosen
     seen = tracks.keep_frames(chosen.frames)
-    camera = make_camera(options.camera, *prepared.size, prepared.pixel_aspect)
+    camera = make_camera(options.camera, *prepared.shown.size, prepared.shown.pixel_aspect)
     context = RunContext.of(options.run)
     try:
         paired = pair_images(
