@@ -147,7 +147,8 @@ def densify(
     """
     model, output = Path(model), Path(output)
     folder = Path(image_path) if image_path is not None else None
-    clock = Clock()
+    context = RunContext.of(options.match.run, progress)
+    clock = context.clock
     read = [model, *paths_of(video), photos, folder, *options.match.files]
     # Check the outputs before the long work.
     check_new_folder(output, MODEL_FILES, read, overwrite=overwrite)
@@ -166,7 +167,6 @@ def densify(
     with unchanged(*inputs.states):
         sizes = {name: _size(cameras[image.camera_id]) for name, image in posed.items()}
         of_videos = images_of_videos(model, sizes, inputs, folder, options.match.images)
-        context = RunContext.of(options.match.run, clock, progress)
         found = [_track(own, output, options, context) for own in of_videos]
         tracked = [images for images, _ in found]
         photos_there = [photo for photo in inputs.photos if photo.name in posed]
@@ -184,7 +184,7 @@ def densify(
                 image_set.images.frames,
                 views,
                 options=options.triangulate,
-                num_threads=options.match.run.num_threads,
+                num_threads=context.num_threads,
                 progress=progress,
             )
         _check_agreement(model, triangulated)
@@ -200,8 +200,7 @@ def densify(
                 image_set,
                 _pictures(image_set, of_videos, photos_there, scratch, options),
                 options=options,
-                clock=clock,
-                progress=progress,
+                context=context,
             )
     with clock.measure("coverage"):
         covered = coverage(views, cloud.xyz)
@@ -278,15 +277,14 @@ def _coloured_cloud(
     pictures: Pictures,
     *,
     options: DensifyOptions,
-    clock: Clock,
-    progress: Progress,
+    context: RunContext,
 ) -> ModelPoints:
     """The points to write, with colours from the pictures."""
 
     def show(stage: str, look: Look) -> None:
-        with clock.measure(stage):
+        with context.clock.measure(stage):
             for done, (image, picture) in enumerate(pictures(list(range(len(views)))), start=1):
-                progress(stage, done, len(views))
+                context.progress(stage, done, len(views))
                 look(image, picture)
 
     cloud = tracked
@@ -297,12 +295,12 @@ def _coloured_cloud(
             image_set.sequence,
             partial(show, "sweep"),
             max_points=options.triangulate.max_points,
-            num_threads=options.match.run.num_threads,
-            clock=clock,
+            num_threads=context.num_threads,
+            clock=context.clock,
         )
     colours = Colours(cloud, [own.size for own in views])
     show("colours", colours.add)
-    with clock.measure("colours"):
+    with context.clock.measure("colours"):
         return replace(cloud, rgb=colours.rgb())
 
 

@@ -61,7 +61,7 @@ from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import check_outside, scratch_folder
-from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
@@ -256,7 +256,6 @@ def match(
     """
     database = Path(database)
     folder = Path(image_path) if image_path is not None else None
-    clock = Clock()
     given = options
 
     before = files_in(folder) if folder is not None else set[Path]()
@@ -265,7 +264,8 @@ def match(
     if folder is not None:
         check_outside(folder, photos)
         check_copies(inputs.photos, folder)
-    context = RunContext.of(options.run, clock, progress)
+    context = RunContext.of(options.run, progress)
+    clock = context.clock
     with unchanged(*inputs.states) as check_videos, ExitStack() as opened:
         scratch = None
         if _is_joint(folder, options):

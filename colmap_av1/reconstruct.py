@@ -41,7 +41,7 @@ from colmap_av1.splats.reconstruct_models import FurtherModel, further_models, w
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import REPORT, check_apart, check_outside, scratch_folder, whole_file
-from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import open_stages
 from colmap_av1.util.texts import some_names
@@ -213,7 +213,6 @@ def reconstruct(
     """
     options = options.with_extension
     output = Path(output)
-    clock = Clock()
     check_apart(output, [*paths_of(video), photos, *options.match.files])
     check_outside(output, photos)
     inputs = read_inputs(video, photos, options.match, flat=True)
@@ -230,7 +229,7 @@ def reconstruct(
                 names_of_all(options.match.images, count) if count <= options.max_images else None
             )
             masks.check([own.picture_size], names, options.match.images)
-    context = RunContext.of(options.match.run, clock, progress)
+    context = RunContext.of(options.match.run, progress)
     with open_stages(output, "reconstruct") as stages, ExitStack() as opened:
         sources = tuple(
             opened.enter_context(
@@ -256,7 +255,7 @@ def reconstruct(
             check_unchanged(*run.files)
             raise
         if gaussians is not None:
-            with clock.measure("gaussians"):
+            with context.clock.measure("gaussians"):
                 write_model_gaussians(Path(gaussians), output / "sparse" / "0")
             report = replace(report, gaussians=Path(gaussians))
         _write_report(report)

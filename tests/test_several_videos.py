@@ -35,7 +35,7 @@ from colmap_av1.geometry.colmap_model import write_model
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.image_set import count_through
+from colmap_av1.images.image_set import number_images
 from colmap_av1.images.inputs import labels_of, read_inputs
 from colmap_av1.map import map_database
 from colmap_av1.match import match
@@ -351,7 +351,7 @@ def test_frames_of_several_videos_are_numbered_consecutively() -> None:
     assert Tracks.in_sequence([one], 5) is one
     chosen = [ChosenImages(["0.png", "4.png"], np.array([0, 4], np.int32))]
     chosen.append(ChosenImages(["2.png"], np.array([2], np.int32)))
-    image_set = count_through(["a", "b"], chosen, [5, 3], ["photos/x.jpg"])
+    image_set = number_images(["a", "b"], chosen, [5, 3], ["photos/x.jpg"])
     assert image_set.images.names == ["a/0.png", "a/4.png", "b/2.png", "photos/x.jpg"]
     assert image_set.images.frames.tolist() == [0, 4, 7, 8]
     assert image_set.sequence.tolist() == [0, 0, 1, 2]

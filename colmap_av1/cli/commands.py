@@ -139,14 +139,14 @@ _REPORT_JSON = Argument(
 
 
 def _match(namespace: argparse.Namespace) -> None:
-    with progress_bars(namespace.quiet) as report:
+    with progress_bars(namespace.quiet) as progress:
         result = colmap_av1.match(
             namespace.database,
             namespace.video,
             photos=namespace.photos,
             image_path=namespace.image_path,
             options=given(namespace, MatchOptions),
-            progress=report,
+            progress=progress,
         )
     write_report_json(namespace, result)
     print_result(namespace, reports.match_rows(result), result.warnings)
@@ -155,14 +155,14 @@ def _match(namespace: argparse.Namespace) -> None:
 
 
 def _map(namespace: argparse.Namespace) -> None:
-    with progress_bars(namespace.quiet) as report:
+    with progress_bars(namespace.quiet) as progress:
         result = colmap_av1.map_database(
             namespace.database,
             namespace.image_path,
             namespace.output,
             options=given(namespace, MapOptions),
             place=given(namespace, PlaceOptions),
-            progress=report,
+            progress=progress,
             overwrite=namespace.overwrite,
         )
     print_result(namespace, reports.map_rows(result), result.warnings)
@@ -176,7 +176,7 @@ def _reconstruct(namespace: argparse.Namespace) -> None:
         output = Path(namespace.output).resolve()  # "." and ".." have no name
         page = output.parent / f"{output.name}.html"
         check_page(page, overwrite=namespace.overwrite)
-    with progress_bars(namespace.quiet) as report:
+    with progress_bars(namespace.quiet) as progress:
         result = colmap_av1.reconstruct(
             namespace.video,
             namespace.output,
@@ -184,7 +184,7 @@ def _reconstruct(namespace: argparse.Namespace) -> None:
             gaussians=namespace.gaussians,
             overwrite=namespace.overwrite,
             options=given(namespace, ReconstructOptions),
-            progress=report,
+            progress=progress,
         )
     rows = reports.reconstruct_rows(result)
     if page is not None:
@@ -203,7 +203,7 @@ def _reconstruct(namespace: argparse.Namespace) -> None:
 
 
 def _densify(namespace: argparse.Namespace) -> None:
-    with progress_bars(namespace.quiet) as report:
+    with progress_bars(namespace.quiet) as progress:
         result = colmap_av1.densify(
             namespace.model,
             namespace.video,
@@ -212,7 +212,7 @@ def _densify(namespace: argparse.Namespace) -> None:
             image_path=namespace.image_path,
             gaussians=namespace.gaussians,
             options=given(namespace, DensifyOptions),
-            progress=report,
+            progress=progress,
             overwrite=namespace.overwrite,
         )
     write_report_json(namespace, result)
@@ -222,14 +222,14 @@ def _densify(namespace: argparse.Namespace) -> None:
 def _compare(namespace: argparse.Namespace) -> int:
     from colmap_av1.compare import compare
 
-    with progress_bars(namespace.quiet) as report:
+    with progress_bars(namespace.quiet) as progress:
         result = compare(
             namespace.video,
             namespace.output,
             image_path=namespace.image_path,
             reference=namespace.reference,
             options=given(namespace, CompareOptions),
-            progress=report,
+            progress=progress,
         )
     for column in result.columns:
         if column.error:
@@ -243,14 +243,14 @@ def _compare(namespace: argparse.Namespace) -> int:
 
 
 def _encode(namespace: argparse.Namespace) -> None:
-    with progress_bars(namespace.quiet) as report:
+    with progress_bars(namespace.quiet) as progress:
         result = colmap_av1.encode(
             namespace.video,
             namespace.output,
             overwrite=namespace.overwrite,
             strict=namespace.strict,
             options=given(namespace, EncodeOptions),
-            progress=report,
+            progress=progress,
         )
     rows = [("frames", str(result.num_frames)), ("encoder", result.encoder)]
     print_result(namespace, [*rows, ("output", str(result.output))])
@@ -259,12 +259,12 @@ def _encode(namespace: argparse.Namespace) -> None:
 def _info(namespace: argparse.Namespace) -> None:
     options = given(namespace, ReadOptions)
     read_out = None
-    with progress_bars(namespace.quiet) as report:
-        result = colmap_av1.read_info(namespace.video, options, report)
+    with progress_bars(namespace.quiet) as progress:
+        result = colmap_av1.read_info(namespace.video, options, progress)
         if namespace.rolling_shutter == "estimate":
             from colmap_av1.matching.shutter.of_video import estimate_video_read_out
 
-            read_out = estimate_video_read_out(namespace.video, options, report)
+            read_out = estimate_video_read_out(namespace.video, options, progress)
     # A text says why it is not observable.
     found = read_out if read_out is None or isinstance(read_out, str) else asdict(read_out)
     write_report_json(namespace, result, read_out=found)
@@ -288,36 +288,36 @@ def _check(namespace: argparse.Namespace) -> int:
 
 def _check_model(namespace: argparse.Namespace) -> bool:
     """Print the diagnosis of a model, and return whether it is consistent."""
-    with progress_bars(namespace.quiet) as report:
+    with progress_bars(namespace.quiet) as progress:
         found = colmap_av1.check_model(
             namespace.model,
             image_path=namespace.image_path,
             database=namespace.database,
-            progress=report,
+            progress=progress,
         )
     print_result(namespace, reports.model_rows(found), found.warnings)
     return not found.warnings
 
 
 def _motion(namespace: argparse.Namespace) -> None:
-    with progress_bars(namespace.quiet) as report:
+    with progress_bars(namespace.quiet) as progress:
         count = colmap_av1.export_motion(
             namespace.video,
             namespace.output,
             given(namespace, ReadOptions),
-            report,
+            progress,
             overwrite=namespace.overwrite,
         )
     print_result(namespace, [("coded frames", str(count)), ("output", namespace.output)])
 
 
 def _export(namespace: argparse.Namespace) -> None:
-    with progress_bars(namespace.quiet) as report:
+    with progress_bars(namespace.quiet) as progress:
         num_images, num_pairs = colmap_av1.export_hloc(
             namespace.database,
             namespace.output,
             given(namespace, ExportOptions),
-            report,
+            progress,
             overwrite=namespace.overwrite,
         )
     rows = [("images", str(num_images)), ("pairs", str(num_pairs))]
@@ -362,14 +362,14 @@ def _view(namespace: argparse.Namespace) -> None:
         picture = view_database(namespace.database, namespace.image_path, namespace.pair)
         write_picture(picture, output, overwrite=overwrite)
         return
-    with progress_bars(namespace.quiet) as report:
+    with progress_bars(namespace.quiet) as progress:
         count = view_video(
             namespace.video,
             output,
             options=given(namespace, ViewOptions),
             tracks=given(namespace, TrackOptions),
             read=given(namespace, ReadOptions),
-            progress=report,
+            progress=progress,
             overwrite=overwrite,
         )
     print_result(namespace, [("frames", str(count)), ("output", output)])

@@ -42,10 +42,10 @@ def add_options(command: Parser, *kinds: type[Options]) -> None:
         argparse.ArgumentError: two fields have the same name.
     """
     for kind in kinds:
-        for options, path in _parts(kind(), kind.__name__, frozenset()):
-            group = command.add_argument_group(options.title)
-            for field in path.fields:
-                _add_option(command, group, options, field, f"{path.name}.{field.name}")
+        for part in _parts(kind(), kind.__name__, frozenset()):
+            group = command.add_argument_group(part.options.title)
+            for field in part.fields:
+                _add_option(command, group, part.options, field, f"{part.name}.{field.name}")
 
 
 def given(namespace: argparse.Namespace, kind: type[_Options]) -> _Options:
@@ -68,12 +68,12 @@ def add_options_of_any(command: Parser, *kinds: type[Options]) -> None:
     """
     added: set[str] = set()
     for kind in kinds:
-        for options, path in _parts(kind(), kind.__name__, frozenset()):
-            fields = [field for field in path.fields if field.name not in added]
+        for part in _parts(kind(), kind.__name__, frozenset()):
+            fields = [field for field in part.fields if field.name not in added]
             if fields:
-                group = command.add_argument_group(options.title)
+                group = command.add_argument_group(part.options.title)
             for field in fields:
-                _add_option(command, group, options, field, f"{_ANY}{field.name}")
+                _add_option(command, group, part.options, field, f"{_ANY}{field.name}")
                 added.add(field.name)
 
 
@@ -91,9 +91,9 @@ def given_of_any(namespace: argparse.Namespace, kind: type[_Options], what: str)
     options = kind()
     left = {k.removeprefix(_ANY): v for k, v in vars(namespace).items() if k.startswith(_ANY)}
     values = {
-        f"{path.name}.{field.name}": left.pop(field.name)
-        for _, path in _parts(options, kind.__name__, frozenset())
-        for field in path.fields
+        f"{part.name}.{field.name}": left.pop(field.name)
+        for part in _parts(options, kind.__name__, frozenset())
+        for field in part.fields
         if field.name in left
     }
     if left:
@@ -110,18 +110,19 @@ def underscored(word: str) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Path:
-    """The path of options within those of the command, and the fields that the command has."""
+class _Part:
+    """Options within those of the command: their path, and the fields that the command has."""
 
+    options: Options
     name: str
     fields: list[dataclasses.Field[Any]]
 
 
-def _parts(options: Options, name: str, unused: Collection[str]) -> Iterator[tuple[Options, _Path]]:
+def _parts(options: Options, name: str, unused: Collection[str]) -> Iterator[_Part]:
     """The options and all options that they contain, except unused ones; the outer ones first."""
     used = [f for f in dataclasses.fields(typing.cast(Any, options)) if f.name not in unused]
     parts = [f for f in used if isinstance(getattr(options, f.name), Options)]
-    yield options, _Path(name, [f for f in used if f not in parts])
+    yield _Part(options, name, [f for f in used if f not in parts])
     for field in parts:
         part = getattr(options, field.name)
         yield from _parts(part, f"{name}.{field.name}", unused_in(field, unused))

@@ -228,7 +228,7 @@ def choose_frames(
     if options.num_images is None:
         return np.arange(num_frames, dtype=np.int32)
     position = times if times is not None else np.arange(num_frames, dtype=np.float64)
-    return _evenly_spread(position, options.num_images)
+    return _spread_by_position(position, options.num_images)
 
 
 def spread_in_parallax(tracks: Tracks, num_images: int) -> NDArray[np.int32]:
@@ -241,7 +241,7 @@ def spread_in_parallax(tracks: Tracks, num_images: int) -> NDArray[np.int32]:
     Returns:
         int32 frame numbers, strictly ascending.
     """
-    return _evenly_spread(np.concatenate([[0.0], np.cumsum(parallax(tracks))]), num_images)
+    return _spread_by_position(np.concatenate([[0.0], np.cumsum(parallax(tracks))]), num_images)
 
 
 def read_frame_list(
@@ -455,7 +455,7 @@ def _at_rate(times: Floats, fps: float) -> NDArray[np.int32]:
     return np.flatnonzero(is_last & (tick < num_ticks)).astype(np.int32)
 
 
-def _evenly_spread(positions: Floats, num_images: int) -> NDArray[np.int32]:
+def _spread_by_position(positions: Floats, num_images: int) -> NDArray[np.int32]:
     """Choose frames evenly by the positions of all frames, which ascend."""
     count = len(positions)
     if num_images > count:
@@ -466,10 +466,10 @@ def _evenly_spread(positions: Floats, num_images: int) -> NDArray[np.int32]:
         )
         return np.arange(count, dtype=np.int32)
     wanted = np.linspace(positions[0], positions[-1], num_images)
-    return _distinct(_nearest(positions, wanted), count)
+    return _distinct(nearest(positions, wanted), count)
 
 
-def _nearest(positions: Floats, wanted: Floats) -> Ints:
+def nearest(positions: NDArray[np.floating] | Ints, wanted: NDArray[np.floating] | Ints) -> Ints:
     """Index of the position nearest to each wanted one, the earlier of two; positions ascend."""
     above = np.clip(np.searchsorted(positions, wanted), 1, max(len(positions) - 1, 1))
     if len(positions) == 1:

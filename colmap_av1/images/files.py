@@ -19,11 +19,10 @@ import numpy as np
 
 from colmap_av1.errors import ImageError, VideoError, writing
 from colmap_av1.images.names import (
-    WRITE_PARAMETERS,
     image_file,
     pattern_regex,
 )
-from colmap_av1.options.images import check_extension
+from colmap_av1.options.images import IMAGE_EXTENSIONS, check_extension
 from colmap_av1.util.arrays import Picture
 from colmap_av1.util.files import may_read, remove_leftovers, whole_file
 from colmap_av1.util.memory import check_memory
@@ -34,8 +33,14 @@ from colmap_av1.video.facts import read_video
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
 
+# OpenCV's parameters for the images that are written, by extension.
+WRITE_PARAMETERS: dict[str, list[int]] = {
+    ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
+    ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95],
+    ".png": [],  # OpenCV's defaults are fast
+}
 # Extensions of images that can be read.
-READABLE = {*WRITE_PARAMETERS, ".bmp", ".tif", ".tiff"}
+READABLE = {*IMAGE_EXTENSIONS, ".bmp", ".tif", ".tiff"}
 # Extensions of images of phones, cameras and programs that cannot be read. They cause a warning,
 # unlike other files.
 UNREADABLE = {

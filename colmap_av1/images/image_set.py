@@ -89,7 +89,7 @@ class ImageSet:
         return ChosenImages(names, frames.astype(np.int32))
 
 
-def count_through(
+def number_images(
     videos: Sequence[str],
     chosen: Sequence[ChosenImages],
     num_frames: Sequence[int],

@@ -11,7 +11,7 @@ from pathlib import Path
 from colmap_av1.errors import OptionError, VideoError
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.image_set import ImageSet, count_through
+from colmap_av1.images.image_set import ImageSet, number_images
 from colmap_av1.images.masks import Masks, VideoMasks, read_masks
 from colmap_av1.images.names import plain_name
 from colmap_av1.images.photos import Photo, photo_files, read_photos
@@ -95,7 +95,7 @@ class Inputs:
         photos = photos if photos is not None else self.photos
         masks = self._masks_of_images(chosen, photos)
         names = [photo.name for photo in photos]
-        return count_through(self.labels, chosen, num_frames, names, masks=masks)
+        return number_images(self.labels, chosen, num_frames, names, masks=masks)
 
     def _masks_of_images(
         self, chosen: Sequence[ChosenImages], photos: Sequence[Photo]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.images.choosing import spread_in_parallax
+from colmap_av1.images.choosing import nearest, spread_in_parallax
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Ints
 
@@ -71,9 +71,7 @@ def spread_images(tracks: Tracks, num_images: int, key: Ints) -> NDArray[np.int3
     """
     spread = spread_in_parallax(tracks, num_images).astype(np.int64)
     # Each key image replaces the nearest other image.
-    after = np.clip(np.searchsorted(spread, key), 1, len(spread) - 1)
-    is_before = key - spread[after - 1] <= spread[after] - key
-    replaced = np.unique(np.where(is_before, after - 1, after))
+    replaced = np.unique(nearest(spread, key))
     return np.union1d(np.delete(spread, replaced), key).astype(np.int32)
 
 

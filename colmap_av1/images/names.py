@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,11 +21,6 @@ from colmap_av1.options.images import (
 from colmap_av1.util.texts import check_name
 
 _MOST_DIGITS = 255
-WRITE_PARAMETERS: dict[str, list[int]] = {
-    ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
-    ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95],
-    ".png": [],  # OpenCV's defaults are fast
-}
 
 
 def image_names(pattern: str, frames: Sequence[int]) -> list[str]:

@@ -26,9 +26,6 @@ class RunContext:
     seed: int = 0
 
     @classmethod
-    def of(
-        cls, run: RunOptions, clock: Clock | None = None, progress: Progress = no_progress
-    ) -> RunContext:
-        """The context of a run with these options; without a clock it gets a new one."""
-        clock = clock if clock is not None else Clock()
-        return cls(clock, progress, threads_or_cpus(run.num_threads), run.seed)
+    def of(cls, run: RunOptions, progress: Progress = no_progress) -> RunContext:
+        """The context of a run with these options, with a new clock."""
+        return cls(Clock(), progress, threads_or_cpus(run.num_threads), run.seed)

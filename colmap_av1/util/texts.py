@@ -23,7 +23,7 @@ _DIRECTIONS = frozenset("\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
-def shown(text: str, most: int = _MOST_SHOWN) -> str:
+def excerpt(text: str, most: int = _MOST_SHOWN) -> str:
     """The start of a text for a message, without characters that control a terminal."""
     return "".join(c if c.isprintable() else "?" for c in text[:most])
 

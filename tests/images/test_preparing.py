@@ -76,7 +76,7 @@ def test_tracks_are_in_pixels_of_scaled_images(clip: Path, tmp_path: Path) -> No
     # A pixel of the images is 2 video pixels wide and 128 / 63 high.
     assert found.shown.pixel_aspect == pytest.approx(2 / (128 / 63))
     listed = {f"{i}.png": (96, 63) for i in range(16)}
-    assert prepared(clip, listed=listed).size == (96, 63)
+    assert prepared(clip, listed=listed).shown.size == (96, 63)
 
 
 @pytest.mark.parametrize(("operating_point", "size"), [(0, (352, 288)), (1, (176, 144))])
@@ -85,11 +85,11 @@ def test_layers_of_a_scalable_stream_have_their_own_size(
 ) -> None:
     options = replace(OPTIONS, read=ReadOptions(operating_point=operating_point))
     first = prepared(LAYERS, tmp_path, options)
-    assert first.size == (first.tracked.tracks.width, first.tracked.tracks.height) == size
+    assert first.shown.size == (first.tracked.tracks.width, first.tracked.tracks.height) == size
     names, frames = first.tracked.chosen.names, first.tracked.chosen.frames
     write_images(LAYERS, tmp_path, names, frames.tolist(), operating_point=operating_point)
     # A second run accepts these images.
-    assert prepared(LAYERS, tmp_path, options).size == size
+    assert prepared(LAYERS, tmp_path, options).shown.size == size
 
 
 def test_stream_of_another_size_than_its_video_is_refused(

@@ -15,7 +15,7 @@ import pytest
 import colmap_av1
 from colmap_av1 import options as all_options
 from colmap_av1.errors import OptionError
-from colmap_av1.images.names import WRITE_PARAMETERS
+from colmap_av1.images.files import WRITE_PARAMETERS
 from colmap_av1.options import (
     CameraOptions,
     CompareOptions,

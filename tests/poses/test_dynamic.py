@@ -31,7 +31,7 @@ from colmap_av1.geometry.triangulation import (
     triangulate,
 )
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.image_set import ShownVideo, count_through
+from colmap_av1.images.image_set import ShownVideo, number_images
 from colmap_av1.images.masks import mask_tracks
 from colmap_av1.options import (
     CameraOptions,
@@ -232,7 +232,7 @@ def test_objects_that_move_between_two_images_do_not_separate_their_links() -> N
     kept = np.ones((HEIGHT, WIDTH), np.bool_)
     kept[:, 100:200] = False
     images = ChosenImages([str(i) for i in range(10)], np.arange(10, dtype=np.int32))
-    image_set = count_through([""], [images], [10])
+    image_set = number_images([""], [images], [10])
     links = Tracks(
         num_frames=10,
         width=WIDTH,

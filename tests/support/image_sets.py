@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.image_set import ImageSet, count_through
+from colmap_av1.images.image_set import ImageSet, number_images
 from colmap_av1.tracks.tracks import Tracks
 
 
@@ -15,7 +15,7 @@ def images(*counts: int) -> ImageSet:
         ChosenImages([f"{k:03}.png" for k in range(count)], np.arange(count, dtype=np.int32))
         for count in counts
     ]
-    return count_through("abcd"[: len(counts)], chosen, counts)
+    return number_images("abcd"[: len(counts)], chosen, counts)
 
 
 def tracks_from(spans: list[list[int]], num_frames: int = 10) -> Tracks:

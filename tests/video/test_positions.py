@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from telemetry import dji_text, gpmf, gpmf_nest, gps5, gps9, grav, with_gpmf
 
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.image_set import count_through
+from colmap_av1.images.image_set import number_images
 from colmap_av1.images.positions import image_positions
 from colmap_av1.video.container import read_file
 from colmap_av1.video.facts import read_video
@@ -278,7 +278,7 @@ def test_positions_of_images_are_interpolated(clip: Path, tmp_path: Path) -> Non
     payloads = [(0.1, gps5(PLACES[:1], fix=0)), (0.3, gps5(PLACES[1:4]))]
     video = read_video(with_gpmf(clip, tmp_path / "gopro.mp4", payloads))
     frames = np.arange(16, dtype=np.int32)
-    image_set = count_through([""], [ChosenImages([f"{k}.png" for k in frames], frames)], [16])
+    image_set = number_images([""], [ChosenImages([f"{k}.png" for k in frames], frames)], [16])
     found = image_positions(image_set, [video], [])
     times = frames / 25
     known = (times >= 0) & (times < 0.4)  # a position is valid until the next one is due

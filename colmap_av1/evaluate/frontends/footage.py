@@ -100,7 +100,7 @@ def convert(
     """
 
     def make() -> Conversion | None:
-        context = RunContext.of(options.run, progress=progress)
+        context = RunContext.of(options.run, progress)
         start = cpu_seconds()
         with open_source(video, options.source, next_to=folder, context=context) as source:
             is_new = source.conversion is not None and not source.is_reused
@@ -137,7 +137,7 @@ def choose_footage(
     images = image_path if image_path is not None else folder / "images"
 
     def make() -> ChosenImages:
-        context = RunContext.of(options.run, progress=progress)
+        context = RunContext.of(options.run, progress)
         with unchanged(video.state) as check_video:
             prepared = prepare_images(
                 video,

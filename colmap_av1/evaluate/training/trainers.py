@@ -28,7 +28,7 @@ from colmap_av1.splats.gaussians import write_model_gaussians
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.processes import bound_group
 from colmap_av1.util.stages import run_stage_in
-from colmap_av1.util.texts import shown
+from colmap_av1.util.texts import excerpt
 
 # Only changes of this code affect the results of a training. Changes elsewhere in the package do
 # not repeat trainings.
@@ -331,7 +331,7 @@ def _positive(word: str) -> float:
 def _run(command: Sequence[str], log: Path) -> None:
     run = subprocess.run(bound_group(command), check=False, stdin=subprocess.DEVNULL)
     if run.returncode != 0:
-        reason = shown(log.read_text(errors="replace").strip().rpartition("\n")[2], _MOST_SHOWN)
+        reason = excerpt(log.read_text(errors="replace").strip().rpartition("\n")[2], _MOST_SHOWN)
         raise EvaluationError(
             f"the trainer ended with status {run.returncode}{reason and f' ({reason})'}: see {log}"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 
-from colmap_av1.util.texts import shown
+from colmap_av1.util.texts import excerpt
 
 # Diagonal in millimetres of the 36 x 24 mm frame that equivalent focal lengths refer to (CIPA
 # DCG-001).
@@ -40,8 +40,8 @@ def implausible_focal_length(tags: tuple[tuple[str, str], ...]) -> str | None:
     if not text or _millimetres(text) is not None:
         return None
     return (
-        f"the container's focal length of '{shown(text)}' mm (35 mm equivalent) is implausible: it "
-        "is ignored"
+        f"the container's focal length of '{excerpt(text)}' mm (35 mm equivalent) is implausible: "
+        "it is ignored"
     )
 
 

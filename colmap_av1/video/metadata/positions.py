@@ -17,7 +17,7 @@ import numpy as np
 
 from colmap_av1.errors import VideoError
 from colmap_av1.util.arrays import Floats
-from colmap_av1.util.texts import shown
+from colmap_av1.util.texts import excerpt
 from colmap_av1.video.container import VideoFile, open_container, until_damage
 from colmap_av1.video.metadata.gpmf import Payload, read_payload
 from colmap_av1.video.metadata.places import are_places
@@ -85,7 +85,7 @@ def implausible_position(tags: tuple[tuple[str, str], ...]) -> str | None:
     text = next((metadata[tag].strip() for tag in _TAGS if metadata.get(tag, "").strip()), None)
     if text is None or _one_place(metadata) is not None:
         return None
-    return f"the container's position '{shown(text)}' is not a place on Earth: it is ignored"
+    return f"the container's position '{excerpt(text)}' is not a place on Earth: it is ignored"
 
 
 def read_positions(video: VideoFile) -> Positions | None:
