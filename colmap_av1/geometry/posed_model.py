@@ -19,7 +19,7 @@ from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import ModelImage, model_points, posed_images
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.util.arrays import Bools, Floats, Ints
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import groups
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,7 @@ def reprojection_errors(model: PosedModel) -> Floats:
     points = model.points
     xyz = points.xyz[points.point]
     errors = np.full(len(points.image), np.inf)
-    by_image, bounds = grouped(points.image, len(model.images))
-    for image, first, last in zip(model.images, bounds[:-1], bounds[1:], strict=True):
-        own = by_image[first:last]
+    for image, own in zip(model.images, groups(points.image, len(model.images)), strict=True):
         in_camera = xyz[own] @ image.cam_from_world[:, :3].T + image.cam_from_world[:, 3]
         ahead = in_camera[:, 2] > 0
         shown = model.cameras[image.camera_id].img_from_cam(in_camera[ahead])

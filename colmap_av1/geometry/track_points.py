@@ -18,7 +18,7 @@ from colmap_av1.geometry.undistortion import Undistortion
 from colmap_av1.options import TrackOptions, TriangulateOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats, Ints, Picture
-from colmap_av1.util.grouping import grouped, indices_in
+from colmap_av1.util.grouping import groups, indices_in
 from colmap_av1.util.progress import Progress, no_progress
 
 # If a smaller share of the tracks agrees with the poses, the model is not of the same video.
@@ -187,7 +187,7 @@ class Colours:
 
     def __init__(self, points: ModelPoints, sizes: Sequence[tuple[int, int]]) -> None:
         self._points, self._sizes = points, np.array(sizes)
-        self._order, self._bounds = grouped(points.image, len(sizes))
+        self._by_image = groups(points.image, len(sizes))
         self._seen = np.zeros((len(points.image), 3), np.uint8)
 
     def add(self, image: int, picture: Picture, undistortion: Undistortion | None = None) -> None:
@@ -195,7 +195,7 @@ class Colours:
 
         The picture has the camera of the model, after `undistortion` if given.
         """
-        own = self._order[self._bounds[image] : self._bounds[image + 1]]
+        own = self._by_image[image]
         size = np.array(undistortion.size if undistortion is not None else picture.shape[1::-1])
         at = self._points.xy[own] * size / self._sizes[image]
         x, y = np.clip(at.astype(np.int64), 0, size - 1).T
@@ -237,10 +237,8 @@ def fitting_in_images(
     """
     lengths = np.diff(points.offsets)
     point = points.point
-    order, bounds = grouped(points.image, len(views))
     apart = np.empty(len(points.image))
-    for image, view in enumerate(views):
-        own = order[bounds[image] : bounds[image + 1]]
+    for view, own in zip(views, groups(points.image, len(views)), strict=True):
         at = view.pixels(view.in_camera(points.xyz[point[own]]))
         apart[own] = np.linalg.norm(at - points.xy[own], axis=1)
     error = np.bincount(point, apart, len(lengths)) / lengths

@@ -79,8 +79,8 @@ class _TracksByImage:
     """Counts the cells of images with tracks that are also observed in another image."""
 
     def __init__(self, tracks: Tracks, frames: NDArray[np.int32], spacing: float) -> None:
-        order, bounds = tracks.by_frame()
-        self._rows = [order[bounds[frame] : bounds[frame + 1]] for frame in frames.tolist()]
+        by_frame = tracks.by_frame()
+        self._rows = [by_frame[frame] for frame in frames.tolist()]
         self._number = tracks.track.astype(np.int32)
         self._xy = tracks.xy
         self._spacing = np.float32(max(spacing, 1.0))

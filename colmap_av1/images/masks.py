@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -321,13 +320,11 @@ def mask_tracks(
     of_all, by_frame = (masks.kept, {}) if isinstance(masks, Mask) else (None, masks)
     kept = np.ones(tracks.num_observations, dtype=np.bool_)
     begins = np.zeros(tracks.num_observations, dtype=np.bool_)
-    order, bounds = tracks.by_frame()
     unseen = _Unseen(tracks)
-    for frame, (first, last) in enumerate(pairwise(bounds.tolist())):
+    for frame, own in enumerate(tracks.by_frame()):
         pixels = by_frame[frame].kept if frame in by_frame else of_all
         if pixels is None:
             continue
-        own = order[first:last]
         passing, between = unseen.at(frame)
         own_size = size if scaled else (pixels.shape[1], pixels.shape[0])
         kept[own] = valid_at(pixels, tracks.xy[own], own_size)

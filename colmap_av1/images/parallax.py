@@ -6,7 +6,7 @@ import numpy as np
 
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import groups
 
 # Focal length assumed for fitting the camera's rotation, in units of the longer side. The remaining
 # motion depends little on it.
@@ -33,12 +33,11 @@ def parallax(tracks: Tracks) -> Floats:
     focal = _FOCAL_LENGTH * max(tracks.width, tracks.height)
     number = tracks.track
     step = np.flatnonzero((np.diff(number) == 0) & (np.diff(tracks.frame) == 1))
-    order, bounds = grouped(tracks.frame[step], tracks.num_frames)
-    step = step[order]
+    by_frame = groups(tracks.frame[step], tracks.num_frames)
     centre = np.array([tracks.width, tracks.height]) / 2
     found = np.full(max(tracks.num_frames - 1, 0), np.nan)
     for frame in range(len(found)):
-        steps = step[bounds[frame] : bounds[frame + 1]]
+        steps = step[by_frame[frame]]
         if len(steps) < 3:
             continue
         steps = steps[:: -(-len(steps) // _MAX_STEPS)]

@@ -12,7 +12,7 @@ from colmap_av1.errors import ImageError
 from colmap_av1.options import PairOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Ints
-from colmap_av1.util.grouping import grouped, indices_in
+from colmap_av1.util.grouping import groups, indices_in
 
 # Spans up to this many images are paired at every image. Longer spans are paired at every n-th
 # image only, where n grows with the span, so the number of pairs stays linear in the number of
@@ -80,15 +80,13 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
     kept = np.flatnonzero(seen & often_enough[track])
 
     # Observations are ordered by track, so a stable sort by image keeps tracks ascending.
-    order, bounds = grouped(image[kept], chosen.size)
-    kept = kept[order]
     return [
         ImageKeypoints(
             frame=int(frame),
-            xy=np.ascontiguousarray(tracks.xy[kept[start:stop]], dtype=np.float32),
-            track=track[kept[start:stop]],
+            xy=np.ascontiguousarray(tracks.xy[kept[own]], dtype=np.float32),
+            track=track[kept[own]],
         )
-        for frame, start, stop in zip(chosen, bounds[:-1], bounds[1:], strict=True)
+        for frame, own in zip(chosen, groups(image[kept], chosen.size), strict=True)
     ]
 
 

@@ -19,6 +19,7 @@ from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.two_view_models import error_by_poses
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.grouping import with_equal_keys
 
 # A track fits the poses of two images if its Sampson error is at most this, in pixels.
 _MAX_ERROR = 4.0
@@ -79,20 +80,18 @@ def _shares_fitting(
     """The share of the tracks across each seam that fit the poses; None for few tracks."""
     if not seams:
         return []
-    order, bounds = tracks.by_frame()
-    track, frame_of, poses = tracks.track, image_set.images.frame_of, model.by_name
+    by_frame, track = tracks.by_frame(), tracks.track
+    frame_of, poses = image_set.images.frame_of, model.by_name
 
     def share(names: tuple[str, str]) -> float | None:
         views = [poses[name] for name in names]
         cameras = [model.cameras[view.camera_id] for view in views]
-        seen = [order[bounds[f] : bounds[f + 1]] for f in (frame_of[name] for name in names)]
-        first, second = (track[own] for own in seen)
-        _, *both = np.intersect1d(first, second, return_indices=True)
-        if len(both[0]) < _FEWEST:
+        seen = with_equal_keys(track, *(by_frame[frame_of[name]] for name in names))
+        if len(seen[0]) < _FEWEST:
             return None
         rays = [
-            np.asarray(camera.cam_from_img(tracks.xy[own[rows]].astype(np.float64))).T
-            for camera, own, rows in zip(cameras, seen, both, strict=True)
+            np.asarray(camera.cam_from_img(tracks.xy[own].astype(np.float64))).T
+            for camera, own in zip(cameras, seen, strict=True)
         ]
         error = error_by_poses([view.cam_from_world for view in views], cameras, rays)
         return float(np.mean(error <= _MAX_ERROR))

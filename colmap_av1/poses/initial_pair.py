@@ -22,7 +22,7 @@ from colmap_av1.matching.mapper_limits import (
     INITIAL_MIN_INLIERS,
 )
 from colmap_av1.util.arrays import Floats, Ints
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import groups
 from colmap_av1.util.spread import evenly_spread
 
 _ENOUGH = round(1.5 * INITIAL_MIN_INLIERS)
@@ -97,8 +97,7 @@ def _candidates(
 ) -> Iterator[_Candidate]:
     poses = np.array([image.cam_from_world for image in images])
     centres = camera_centres(poses)
-    by_view, bounds = grouped(view, len(images))
-    seen = np.split(point[by_view], bounds[1:-1])
+    seen = [point[own] for own in groups(view, len(images))]
     for first in evenly_spread(len(images), _NUM_FIRST):
         for second in (first + span for span in _SPANS if first + span < len(images)):
             common = np.intersect1d(seen[first], seen[second], assume_unique=True)

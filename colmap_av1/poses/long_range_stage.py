@@ -22,7 +22,7 @@ from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import groups
 from colmap_av1.util.stages import Kept, run_stage
 
 # About the number of tracks whose points determine which images overlap; short ones are ignored.
@@ -115,5 +115,5 @@ def _points_by_image(run: Run, tracks: Tracks, registered: PosedImages) -> list[
     """Float64 [n, 3] some points that each image observes."""
     some = tracks.every_nth(max(1, tracks.num_tracks // _NUM_TRACKS))
     points = triangulate_in(run, registered, pose_tracks(run, some), FOR_POSES).model_points()
-    order, bounds = grouped(points.image, len(registered.images))
-    return np.split(points.xyz[points.point[order]], bounds[1:-1])
+    xyz = points.xyz[points.point]
+    return [xyz[own] for own in groups(points.image, len(registered.images))]

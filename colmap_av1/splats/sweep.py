@@ -31,7 +31,7 @@ from colmap_av1.splats.ray_search import (
     sweep_image,
 )
 from colmap_av1.util.arrays import Bools, Floats
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import groups
 from colmap_av1.util.spread import evenly_spread
 
 # Every second image is swept, but at most _MOST_IMAGES, evenly spread.
@@ -143,10 +143,8 @@ class Sweep:
 def _nearest_observed(points: ModelPoints, views: Sequence[PosedCamera]) -> list[Floats]:
     """Depth of the nearest observed point in each cell of each image; inf without one."""
     owner = points.point
-    by_image, bounds = grouped(points.image, len(views))
     grids = []
-    for image, view in enumerate(views):
-        own = by_image[bounds[image] : bounds[image + 1]]
+    for view, own in zip(views, groups(points.image, len(views)), strict=True):
         axis = view.cam_from_world[2]
         depth = points.xyz[owner[own]] @ axis[:3] + axis[3]
         grids.append(nearest_in_cells(view.size, points.xy[own], depth))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Ints
+from colmap_av1.util.grouping import with_equal_keys
 from colmap_av1.video.coded_size import smaller_grey
 
 _Floats = NDArray[np.float32]
@@ -79,12 +80,7 @@ def follow_corners(
         Tracks with observations in at least three pictures; their frames are those of `guide` and
         their positions are in pixels of the pictures.
     """
-    by_frame, bounds = guide.by_frame()
-    track = guide.track
-
-    def observations(frame: int) -> Ints:
-        return by_frame[bounds[frame] : bounds[frame + 1]]
-
+    by_frame, track = guide.by_frame(), guide.track
     seen: list[tuple[int, Ints, _Floats]] = []
     before: tuple[int, NDArray[np.uint8]] | None = None
     number, at = np.empty(0, np.int64), np.empty((0, 2), np.float32)
@@ -96,7 +92,8 @@ def follow_corners(
         scale = (np.array(picture.shape[1::-1]) / grey.shape[::-1]).astype(np.float32)
         usable = partial(_are_usable, is_valid, frame, grey.shape[::-1])
         if before is not None and len(at):
-            start, motion = _motion(observations(before[0]), observations(frame), guide.xy, track)
+            first, second = with_equal_keys(track, by_frame[before[0]], by_frame[frame])
+            start, motion = guide.xy[first], guide.xy[second] - guide.xy[first]
             expected = _nearest(start / scale, motion / scale, at)
             at, followed = _follow(before[1], grey, at, expected)
             followed &= usable(at)
@@ -111,27 +108,6 @@ def follow_corners(
         if progress is not None:
             progress(len(seen))
     return _as_tracks(guide, seen, scale)
-
-
-def _motion(
-    before: Ints,
-    now: Ints,
-    xy: _Floats,
-    track: Ints,
-) -> tuple[_Floats, _Floats]:
-    """Position in the first frame, and motion to the second, of the tracks observed in both.
-
-    Args:
-        before: indices of the observations in the first frame.
-        now: indices of the observations in the second frame.
-        xy: positions of all observations.
-        track: track of each observation.
-    """
-    _, first, second = np.intersect1d(
-        track[before], track[now], assume_unique=True, return_indices=True
-    )
-    start = xy[before[first]]
-    return start, xy[now[second]] - start
 
 
 def _nearest(start: _Floats, motion: _Floats, at: _Floats) -> _Floats:

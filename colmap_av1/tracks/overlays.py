@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import groups
 
 # Largest motion of an overlay in pixels: the finest step of a motion vector.
 _STILL = 0.125
@@ -59,13 +59,12 @@ def _picture_motion(tracks: Tracks) -> Floats:
     step = _length(tracks.xy[to] - tracks.xy[to - 1])
     frame = tracks.frame[to]
     step /= frame - tracks.frame[to - 1]
-    order, bounds = grouped(frame, tracks.num_frames)
-    by_frame = np.split(step[order], bounds[1:-1])
+    by_frame = [step[own] for own in groups(frame, tracks.num_frames)]
     # For each frame with observations, the number of frames since the previous one with any.
     observed = np.flatnonzero(np.bincount(tracks.frame))
     since = dict(zip(observed[1:].tolist(), np.diff(observed).tolist(), strict=True))
     motion = np.zeros(tracks.num_frames)
-    for index in np.flatnonzero(np.diff(bounds)).tolist():
+    for index in np.unique(frame).tolist():
         middle = len(by_frame[index]) // 2
         motion[index] = np.partition(by_frame[index], middle)[middle] * since[index]
     return motion

@@ -196,7 +196,7 @@ class RefinedTracks:
     ) -> None:
         """Correct the observations in all frames, see `refine_tracks`."""
         tracks = self.tracks
-        by_frame, bounds = tracks.by_frame()
+        by_frame = tracks.by_frame()
         next_frame = 0
         for count, (index, image) in enumerate(frames, start=1):
             if index < next_frame or index >= tracks.num_frames:
@@ -207,14 +207,14 @@ class RefinedTracks:
                     f"{tracks.width}x{tracks.height}: re-encode the video at one size"
                 )
             for missing in range(next_frame, index):
-                self.skip(by_frame[bounds[missing] : bounds[missing + 1]])
+                self.skip(by_frame[missing])
             grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-            self.refine(by_frame[bounds[index] : bounds[index + 1]], grey)
+            self.refine(by_frame[index], grey)
             next_frame = index + 1
             if progress is not None:
                 progress(count)
         for missing in range(next_frame, tracks.num_frames):
-            self.skip(by_frame[bounds[missing] : bounds[missing + 1]])
+            self.skip(by_frame[missing])
 
     def skip(self, seen: Ints) -> None:
         """Move the observations in a frame without a picture by the bitstream's steps."""

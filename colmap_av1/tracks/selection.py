@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from colmap_av1 import _core
 from colmap_av1.options import DensityOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import groups
 
 
 @dataclass(frozen=True)
@@ -152,10 +151,8 @@ def _error_shares(
         return np.zeros(tracks.num_frames, dtype=np.float32)
     shares = np.full(tracks.num_frames, _MAX_ERROR_SHARE, dtype=np.float32)
     usable = np.flatnonzero(error <= _MAX_ERROR_SHARE * distance)
-    order, bounds = grouped(tracks.frame[usable], tracks.num_frames)
-    usable = usable[order]
-    for frame, (start, stop) in enumerate(pairwise(bounds)):
-        own = usable[start:stop]
+    for frame, rows in enumerate(groups(tracks.frame[usable], tracks.num_frames)):
+        own = usable[rows]
         if len(own) <= wide_tracks:
             continue
         farthest = np.partition(distance[own], -wide_tracks)[-wide_tracks]

@@ -15,7 +15,7 @@ from colmap_av1.errors import VideoError
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.options import TrackOptions
 from colmap_av1.util.arrays import Bools, Ints
-from colmap_av1.util.grouping import grouped, indices_in
+from colmap_av1.util.grouping import groups, indices_in
 from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.video.display import Display, shown_points, shown_size
@@ -178,9 +178,9 @@ class Tracks:
             confirmed=np.ones(len(order), np.bool_),
         )
 
-    def by_frame(self) -> tuple[Ints, Ints]:
-        """Order of the observations by frame, and the bounds of the frames in it, see `grouped`."""
-        return grouped(self.frame, self.num_frames)
+    def by_frame(self) -> list[Ints]:
+        """The indices of the observations in each frame, in the order of their tracks."""
+        return groups(self.frame, self.num_frames)
 
     def having(self, observations: Bools) -> Bools:
         """Which tracks have any of these observations: bool [num_tracks].
@@ -267,8 +267,8 @@ class Tracks:
         if frames is not None:  # copying all observations of a still picture needs much memory
             repeats = repeats[np.isin(repeats, frames)]
         # The observations of each frame, and how often they are repeated.
-        order, bounds = self.by_frame()
-        copies = [order[bounds[frame] : bounds[frame + 1]] for frame in first[repeats].tolist()]
+        by_frame = self.by_frame()
+        copies = [by_frame[frame] for frame in first[repeats].tolist()]
         source = np.concatenate([np.arange(self.num_observations), *copies])
         added = np.repeat(repeats, [len(copy) for copy in copies])
         frame = np.concatenate([self.frame, added.astype(np.int32)])

@@ -28,6 +28,29 @@ def grouped(key: NDArray[np.integer[Any]], num_groups: int) -> tuple[Ints, Ints]
     return order, bounds
 
 
+def groups(key: NDArray[np.integer[Any]], num_groups: int) -> list[Ints]:
+    """The indices of the elements of each group, see `grouped`."""
+    order, bounds = grouped(key, num_groups)
+    return np.split(order, bounds[1:-1])
+
+
+def with_equal_keys(key: NDArray[np.integer[Any]], first: Ints, second: Ints) -> tuple[Ints, Ints]:
+    """Pair the elements of two sets that have the same key, such as the track of an observation.
+
+    Args:
+        key: integers [n], the key of each element.
+        first: indices of elements with distinct keys.
+        second: indices of other elements with distinct keys.
+
+    Returns:
+        The elements of `first` and of `second` that have an equal in the other set, ordered by key.
+    """
+    _, of_first, of_second = np.intersect1d(
+        key[first], key[second], assume_unique=True, return_indices=True
+    )
+    return first[of_first], second[of_second]
+
+
 def indices_in(chosen: NDArray[np.integer[Any]], count: int) -> NDArray[np.int32]:
     """The index of each number in an array of distinct numbers.
 

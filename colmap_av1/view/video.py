@@ -125,8 +125,7 @@ class _Drawing:
     Attributes:
         tracks: all tracks.
         options: what is drawn.
-        by_frame: int64 [num_observations] observations sorted by frame.
-        bounds: int64 [num_frames + 1] bounds of the frames in `by_frame`.
+        by_frame: the observations in each frame.
         age: int64 [num_observations] number of earlier observations of the same track.
         velocity: float32 [num_observations, 2] pixels per frame since the previous observation; at
             the start of a track, until the next one.
@@ -136,21 +135,15 @@ class _Drawing:
 
     tracks: Tracks
     options: ViewOptions
-    by_frame: Ints
-    bounds: Ints
+    by_frame: list[Ints]
     age: Ints
     velocity: NDArray[np.float32]
     full_speed: float
     has_tail: Bools
 
-    def seen_in(self, frame: int) -> Ints:
-        """The observations in a frame."""
-        return self.by_frame[self.bounds[frame] : self.bounds[frame + 1]]
-
 
 def _prepare(tracks: Tracks, options: ViewOptions) -> _Drawing:
     length = tracks.lengths
-    by_frame, bounds = tracks.by_frame()
     step = np.diff(tracks.xy, axis=0, prepend=tracks.xy[:1])
     interval = np.diff(tracks.frame, prepend=tracks.frame[:1])
     starts = tracks.offsets[:-1][length > 1]
@@ -161,8 +154,7 @@ def _prepare(tracks: Tracks, options: ViewOptions) -> _Drawing:
     return _Drawing(
         tracks=tracks,
         options=options,
-        by_frame=by_frame,
-        bounds=bounds,
+        by_frame=tracks.by_frame(),
         age=np.arange(tracks.num_observations) - np.repeat(tracks.offsets[:-1], length),
         velocity=velocity,
         full_speed=max(full_speed, _LEAST_FULL_SPEED),
@@ -193,7 +185,7 @@ def _draw_motion(picture: Picture, drawing: _Drawing, frame: int) -> Picture:
     """Colour every unit with a track by the direction of its motion."""
     height, width = picture.shape[:2]
     rows, cols = -(-height // _UNIT), -(-width // _UNIT)
-    seen = drawing.seen_in(frame)
+    seen = drawing.by_frame[frame]
     unit = np.floor(drawing.tracks.xy[seen] / _UNIT).astype(np.int64)
     colours = np.full((rows, cols, 3), _GREY, dtype=np.uint8)
     row, col = np.clip(unit[:, 1], 0, rows - 1), np.clip(unit[:, 0], 0, cols - 1)
@@ -211,7 +203,7 @@ def _draw_motion(picture: Picture, drawing: _Drawing, frame: int) -> Picture:
 def _draw_tracks(picture: Picture, drawing: _Drawing, frame: int) -> Picture:
     """Draw a dot for each chosen track, and a tail along its previous positions."""
     drawn = picture.copy()
-    seen = drawing.seen_in(frame)
+    seen = drawing.by_frame[frame]
     seen = seen[drawing.has_tail[seen]]
     tail = drawing.options.tail
     shade = np.minimum(drawing.age[seen] * 255 // _OLD_AGE, 255).astype(np.uint8)

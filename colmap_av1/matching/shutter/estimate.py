@@ -12,6 +12,7 @@ from colmap_av1.matching.pairs import ImageKeypoints, pair_matches
 from colmap_av1.tracks.shutter import at_middle_of_read_out, row_times, velocities
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats
+from colmap_av1.util.grouping import with_equal_keys
 from colmap_av1.util.spread import evenly_spread
 
 # Read-out times to try, in frame periods; negative if rows are read from the bottom.
@@ -109,8 +110,7 @@ def _views(tracks: Tracks, down: tuple[int, int], seed: int) -> list[_View]:
     speed = velocities(tracks)
     time = row_times(tracks.xy, (tracks.width, tracks.height), down)
     centre = np.array([tracks.width, tracks.height]) / 2
-    order, bounds = tracks.by_frame()
-    number = tracks.track
+    by_frame, track = tracks.by_frame(), tracks.track
     views = []
     last = tracks.num_frames - 1 - _GAPS[0]
     for first in evenly_spread(max(last, 0) + 1, _NUM_PAIRS):
@@ -118,13 +118,10 @@ def _views(tracks: Tracks, down: tuple[int, int], seed: int) -> list[_View]:
         for gap in _GAPS:
             if first + gap >= tracks.num_frames:
                 break
-            a, b = (order[bounds[f] : bounds[f + 1]] for f in (first, first + gap))
-            _, in_a, in_b = np.intersect1d(
-                number[a], number[b], assume_unique=True, return_indices=True
-            )
-            if len(in_a) < _MIN_MATCHES:
+            shared = with_equal_keys(track, by_frame[first], by_frame[first + gap])
+            if len(shared[0]) < _MIN_MATCHES:
                 break
-            found = a[in_a], b[in_b]
+            found = shared
             motion = tracks.xy[found[1]] - tracks.xy[found[0]]
             spread = np.abs(motion - np.median(motion, axis=0)).sum(axis=1)
             if np.median(spread) >= _LEAST_SPREAD:

@@ -25,7 +25,7 @@ from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.slopes import surface_slopes
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Floats, Ints, Picture
-from colmap_av1.util.grouping import grouped, indices_in
+from colmap_av1.util.grouping import groups, indices_in
 from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.threads import map_on_threads
 
@@ -106,12 +106,12 @@ def match_patches(
     image = corners.view[points.observation]
     xy = tracks.xy[points.observation].astype(np.float64)
     middle = (points.offsets[:-1] + points.offsets[1:]) // 2
-    by_image, bounds = grouped(image, len(views))
+    by_image = groups(image, len(views))
     patches = _cut(points, middle, image, xy, views=views, pictures=pictures)
     found = [(np.arange(len(points.xyz)), image[middle], xy[middle])]
 
     def search(number: int) -> tuple[Ints, Ints, Floats]:
-        followed = by_image[bounds[number] : bounds[number + 1]]
+        followed = by_image[number]
         own, at = point[followed], xy[followed]
         if number not in pictures:
             return own[:0], own[:0], at[:0]

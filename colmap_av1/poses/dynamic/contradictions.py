@@ -7,7 +7,6 @@ would occlude points that other images see, or be occluded by a surface that oth
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,7 +17,7 @@ from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.geometry.triangulation import SIGMA_FLOOR
 from colmap_av1.util.arrays import Bools, Floats, Ints
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import groups
 from colmap_av1.util.threads import map_on_threads
 
 # Residual of a track, in expected errors, above which it contradicts the poses and below which it
@@ -125,10 +124,8 @@ def tracks_in_cells(
     owner = track[points.observation[points.offsets[:-1]]]
     xyz[owner[order]] = points.xyz[order]
     error, depth = np.full(len(track), np.nan), np.full(len(track), np.nan)
-    by_image, bounds = grouped(image, len(views))
-    for number, view in enumerate(views):
-        own = by_image[bounds[number] : bounds[number + 1]]
-        own = own[np.isfinite(xyz[track[own], 0])]
+    for view, seen in zip(views, groups(image, len(views)), strict=True):
+        own = seen[np.isfinite(xyz[track[seen], 0])]
         local = view.in_camera(xyz[track[own]])
         ahead = local[:, 2] > 0
         own, local = own[ahead], local[ahead]
@@ -180,8 +177,7 @@ class Contradictions:
         num_threads: int | None = None,
     ) -> None:
         self._tracks, self._num_threads = tracks, num_threads
-        by_image, bounds = grouped(tracks.image, len(views))
-        self._seen = [by_image[a:b] for a, b in itertools.pairwise(bounds)]
+        self._seen = groups(tracks.image, len(views))
         self._views = views
         self._there = np.flatnonzero(np.isfinite(tracks.xyz[:, 0]))
         self._kept: list[_Shown] | None = None

@@ -25,7 +25,7 @@ from colmap_av1.poses.run import Run
 from colmap_av1.tracks.refine import refine_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools
-from colmap_av1.util.grouping import grouped
+from colmap_av1.util.grouping import groups
 from colmap_av1.util.progress import progress_in
 
 # Number of images after the last observation of a point in which it is searched; later its
@@ -125,11 +125,11 @@ def expect_in_views(
     point = points.point
     seen_by = triangulated.view[points.observation]
     first, last = seen_by[points.offsets[:-1]], seen_by[points.offsets[1:] - 1]
-    by_view, bounds = grouped(seen_by, len(views))
+    by_view = groups(seen_by, len(views))
     points_in, xy_in = [point], [tracks.xy[points.observation]]
     for number, camera in enumerate(views):
         near = np.flatnonzero((first < number) & (last >= number - _REACH))
-        there = np.setdiff1d(near, point[by_view[bounds[number] : bounds[number + 1]]])
+        there = np.setdiff1d(near, point[by_view[number]])
         index, xy, _ = camera.project(points.xyz[there])
         index = there[index]
         inside = (xy >= _MARGIN) & (xy <= np.array(camera.size) - _MARGIN)

@@ -116,10 +116,10 @@ def without_dynamic_links(
     """
     images = image_set.images
     kept = np.ones(links.num_observations, np.bool_)
-    order, bounds = links.by_frame()
+    by_frame = links.by_frame()
     for frame, name in zip(images.frames.tolist(), images.names, strict=True):
         if name in dynamic_masks:
-            mask, own = dynamic_masks[name], order[bounds[frame] : bounds[frame + 1]]
+            mask, own = dynamic_masks[name], by_frame[frame]
             kept[own] = mask.keeps(links.xy[own], mask.size)
     return links.keep_observations(kept).keep_long(_MIN_LINKED)
 
