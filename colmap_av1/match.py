@@ -330,7 +330,7 @@ def match(
         )
     videos = images.videos
     kinds = Counter(geometry.config.name for geometry in written.geometries)
-    num_inliers = [len(geometry.inlier_matches) for geometry in written.geometries]
+    num_inliers = written.num_inliers
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
     notes += (*positions.warnings, *found.warnings)
     doubts = [crash, found.depth.warning, focal_length_warning(found.cameras)]

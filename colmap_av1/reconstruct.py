@@ -401,13 +401,13 @@ def _warnings(
             f"{len(not_registered)} of {num_images} images are not registered: "
             f"{some_names(not_registered)}"
         )
-    left_out = [
+    without_images = [
         name
         for video, name in enumerate(image_set.videos)
         if set(image_set.of_video(video).names) <= set(not_registered)
     ]
-    if left_out and not further:
-        names = ", ".join(f"'{name}'" for name in left_out)
+    if without_images and not further:
+        names = ", ".join(f"'{name}'" for name in without_images)
         warnings.append(
             f"the model has no image of {names}: reconstruct videos of another scene separately"
         )

@@ -20,7 +20,6 @@ from colmap_av1.geometry.triangulation import (
 )
 from colmap_av1.options import TriangulateOptions
 from colmap_av1.util.arrays import Bools, Floats, Ints
-from colmap_av1.util.grouping import take_rows
 
 # Distances with a smaller relative uncertainty determine the depth of the scene.
 _KNOWN = 0.3
@@ -45,31 +44,6 @@ _TINY = 1e-12
 
 
 @dataclass(frozen=True)
-class _Points:
-    """Points and their observations in compressed sparse row form, as in TriangulatedPoints."""
-
-    xyz: Floats
-    error: Floats
-    offsets: Ints
-    observation: Ints
-
-    @property
-    def point(self) -> Ints:
-        """Index of the point of each observation: int64 [num_observations]."""
-        return np.repeat(np.arange(len(self.xyz)), np.diff(self.offsets))
-
-    @property
-    def middle(self) -> Ints:
-        """The middle observation of each point."""
-        return np.asarray(self.observation[(self.offsets[:-1] + self.offsets[1:]) // 2])
-
-    def take(self, rows: Ints) -> _Points:
-        """Select points, in the order of `rows`."""
-        offsets, seen = take_rows(self.offsets, rows)
-        return _Points(self.xyz[rows], self.error[rows], offsets, self.observation[seen])
-
-
-@dataclass(frozen=True)
 class _Seen:
     """The observations of the tracks, and the views."""
 
@@ -88,7 +62,7 @@ class _Seen:
         """Camera centres of some observations, float64 [n, 3]."""
         return self.centres[self.observations.view[rows]]
 
-    def of_points(self, points: _Points) -> dict[str, Any]:
+    def of_points(self, points: TriangulatedPoints) -> dict[str, Any]:
         """Arguments of the core for points and the views that observe them."""
         return {
             "cam_from_world": np.ascontiguousarray(self.views.cam_from_world),
@@ -100,7 +74,7 @@ class _Seen:
             "observation": points.observation,
         }
 
-    def errors(self, points: _Points) -> Floats:
+    def errors(self, points: TriangulatedPoints) -> Floats:
         """Reprojection errors in pixels of the points' observations; inf behind the camera."""
         return _core.reprojection_errors(**self.of_points(points))
 
@@ -135,22 +109,20 @@ def splat_points(
     )
     found = triangulate(observations, views, anywhere, num_threads=num_threads, progress=progress)
     seen = _Seen(observations, views, camera_centres(views.cam_from_world))
-    points = _Points(found.xyz, found.error, found.offsets, found.observation)
     unsure = distance_uncertainty(
-        points.xyz,
-        points.error,
-        points.offsets,
+        found.xyz,
+        found.error,
+        found.offsets,
         centres=seen.centres,
-        view=observations.view[points.observation],
+        view=observations.view[found.observation],
         focal=views.focal.mean(axis=1),
     )
-    far = _far_distance(points, unsure, seen)
-    points = _at_likely_distance(points, unsure, far, seen)
+    far = _far_distance(found, unsure, seen)
+    points = _at_likely_distance(found, unsure, far, seen)
     far_away = _points_far_away(points, far, seen, options)
     points = _merged(points, far_away)
     points = points.take(np.flatnonzero(~_is_floater(points, seen)))
-    num_agreeing = found.num_agreeing + len(far_away.xyz)
-    return replace(found, num_agreeing=num_agreeing, **vars(points))
+    return replace(points, num_agreeing=found.num_agreeing + len(far_away.xyz))
 
 
 def distance_uncertainty(
@@ -180,12 +152,12 @@ def distance_uncertainty(
     return np.asarray(sigma / (focal[middle] * np.maximum(angle, _TINY)))
 
 
-def _distance(points: _Points, seen: _Seen) -> Floats:
+def _distance(points: TriangulatedPoints, seen: _Seen) -> Floats:
     """Distance of each point from the view of its middle observation."""
     return np.asarray(np.linalg.norm(points.xyz - seen.origins(points.middle), axis=1))
 
 
-def _far_distance(points: _Points, unsure: Floats, seen: _Seen) -> float:
+def _far_distance(points: TriangulatedPoints, unsure: Floats, seen: _Seen) -> float:
     """Assumed distance of the scene's far field."""
     extent = float(np.linalg.norm(seen.centres - seen.centres.mean(axis=0), axis=1).max())
     known = _distance(points, seen)[unsure < _KNOWN]
@@ -193,7 +165,9 @@ def _far_distance(points: _Points, unsure: Floats, seen: _Seen) -> float:
     return max(_FAR * deepest, _FAR_EXTENTS * extent) or _ANY_FAR
 
 
-def _at_likely_distance(points: _Points, unsure: Floats, far: float, seen: _Seen) -> _Points:
+def _at_likely_distance(
+    points: TriangulatedPoints, unsure: Floats, far: float, seen: _Seen
+) -> TriangulatedPoints:
     """Move points along their middle ray towards the far field, within their uncertainty.
 
     The inverse distance is combined with a prior at the far field, whose standard deviation is the
@@ -216,7 +190,7 @@ def _at_likely_distance(points: _Points, unsure: Floats, far: float, seen: _Seen
     return _with_errors(replace(points, xyz=xyz), seen)
 
 
-def _with_errors(points: _Points, seen: _Seen) -> _Points:
+def _with_errors(points: TriangulatedPoints, seen: _Seen) -> TriangulatedPoints:
     """The points with updated mean errors, without those behind one of their cameras."""
     if len(points.xyz) == 0:
         return points
@@ -225,19 +199,20 @@ def _with_errors(points: _Points, seen: _Seen) -> _Points:
 
 
 def _points_far_away(
-    points: _Points, far: float, seen: _Seen, options: TriangulateOptions
-) -> _Points:
+    points: TriangulatedPoints, far: float, seen: _Seen, options: TriangulateOptions
+) -> TriangulatedPoints:
     """Far-field points of tracks without a point, if enough observations fit."""
     offsets = seen.observations.offsets
     track = np.searchsorted(offsets, points.observation[points.offsets[:-1]], side="right") - 1
     has_point = np.zeros(len(offsets) - 1, np.bool_)
     has_point[track] = True
     left = np.flatnonzero(~has_point & (np.diff(offsets) >= options.min_observations))
-    tracks = _Points(
-        np.empty((len(offsets) - 1, 3)),
-        np.empty(len(offsets) - 1),
-        offsets,
-        np.arange(offsets[-1]),
+    tracks = replace(
+        points,
+        xyz=np.empty((len(offsets) - 1, 3)),
+        error=np.empty(len(offsets) - 1),
+        offsets=offsets,
+        observation=np.arange(offsets[-1]),
     ).take(left)
     if len(left) == 0:
         return tracks
@@ -246,24 +221,29 @@ def _points_far_away(
     kept = seen.errors(replace(tracks, xyz=xyz)) <= options.max_reprojection_error
     point = tracks.point[kept]
     counts = np.bincount(point, minlength=len(left))
-    far_away = _Points(
-        xyz, np.zeros(len(left)), np.concatenate([[0], np.cumsum(counts)]), tracks.observation[kept]
+    far_away = replace(
+        points,
+        xyz=xyz,
+        error=np.zeros(len(left)),
+        offsets=np.concatenate([[0], np.cumsum(counts)]),
+        observation=tracks.observation[kept],
     ).take(np.flatnonzero(counts >= options.min_observations))
     return _with_errors(far_away, seen)
 
 
-def _merged(one: _Points, two: _Points) -> _Points:
+def _merged(one: TriangulatedPoints, two: TriangulatedPoints) -> TriangulatedPoints:
     """Merge points, in the order of their tracks."""
-    both = _Points(
-        np.concatenate([one.xyz, two.xyz]),
-        np.concatenate([one.error, two.error]),
-        np.concatenate([one.offsets, two.offsets[1:] + one.offsets[-1]]),
-        np.concatenate([one.observation, two.observation]),
+    both = replace(
+        one,
+        xyz=np.concatenate([one.xyz, two.xyz]),
+        error=np.concatenate([one.error, two.error]),
+        offsets=np.concatenate([one.offsets, two.offsets[1:] + one.offsets[-1]]),
+        observation=np.concatenate([one.observation, two.observation]),
     )
     return both.take(np.argsort(both.observation[both.offsets[:-1]], kind="stable"))
 
 
-def _is_floater(points: _Points, seen: _Seen) -> Bools:
+def _is_floater(points: TriangulatedPoints, seen: _Seen) -> Bools:
     """Whether each point is a floater: nearly alone far in front of its surroundings."""
     votes = _core.floater_observations(
         **seen.of_points(points),

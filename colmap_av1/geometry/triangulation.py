@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from colmap_av1 import _core
 from colmap_av1.options import TriangulateOptions
 from colmap_av1.util.arrays import Floats, Ints
+from colmap_av1.util.grouping import take_rows
 from colmap_av1.util.threads import map_on_threads
 
 # Result of the core for a range of tracks, see `TriangulatedPoints`.
@@ -84,6 +85,22 @@ class TriangulatedPoints:
     def point(self) -> Ints:
         """Index of the point of each observation: int64 [num_observations]."""
         return np.repeat(np.arange(len(self.xyz)), np.diff(self.offsets))
+
+    @property
+    def middle(self) -> Ints:
+        """The middle observation of each point: int64 [num_points]."""
+        return np.asarray(self.observation[(self.offsets[:-1] + self.offsets[1:]) // 2])
+
+    def take(self, rows: Ints) -> TriangulatedPoints:
+        """Select points, in the order of `rows`."""
+        offsets, seen = take_rows(self.offsets, rows)
+        return replace(
+            self,
+            xyz=self.xyz[rows],
+            error=self.error[rows],
+            offsets=offsets,
+            observation=self.observation[seen],
+        )
 
 
 def triangulate(

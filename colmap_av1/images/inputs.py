@@ -63,12 +63,12 @@ class Inputs:
         kept = [any(name.startswith(f"{label}/") for name in names) for label in self.labels]
         if all(kept) or not any(kept):
             return self
-        left_out = [str(v) for v, is_kept in zip(self.videos, kept, strict=True) if not is_kept]
+        unused = [str(v) for v, is_kept in zip(self.videos, kept, strict=True) if not is_kept]
         return replace(
             self,
             videos=tuple(itertools.compress(self.videos, kept)),
             labels=tuple(itertools.compress(self.labels, kept)),
-            warnings=(*self.warnings, f"the model has no image of {', '.join(left_out)}"),
+            warnings=(*self.warnings, f"the model has no image of {', '.join(unused)}"),
         )
 
     @property

@@ -67,7 +67,7 @@ def image_positions(
         found = read_positions(video)
         if found is None:
             continue
-        notes += [found.left_out] if found.left_out is not None else []
+        notes += [found.ignored] if found.ignored is not None else []
         one += [found.place] if found.place is not None else []
         if not (len(found.times) or len(found.gravity_times)):
             continue

@@ -122,7 +122,7 @@ def prepare_start(
             # The mapper lowers its limits for the images that its first models leave.
             is_bad = found.is_wrong & (found.angle >= _WIDE_SHARE * _LEAST_ANGLE)
             matched = with_demoted(matched, np.flatnonzero(is_bad), _LEAST_INLIERS - 1)
-            found = replace(found, count=_num_inliers(matched))
+            found = replace(found, count=matched.num_inliers)
         limits = FORWARD_MOTION if matched.forward_motion else DEFAULT_LIMITS
         search, demote = None, set[int]()
         if known:
@@ -179,11 +179,6 @@ def with_demoted(
     return replace(matched, geometries=geometries)
 
 
-def _num_inliers(matched: MatchedImages) -> Ints:
-    """Number of inliers of each pair, int64 [num_pairs]."""
-    return np.array([len(own.inlier_matches) for own in matched.geometries], np.int64)
-
-
 @dataclass(frozen=True)
 class _Candidates:
     """What decides whether the mapper may begin with each pair of images.
@@ -220,7 +215,7 @@ class _Candidates:
         known: Sequence[Sequence[Floats | None]],
     ) -> _Candidates:
         """Look at the poses of all pairs."""
-        count = _num_inliers(matched)
+        count = matched.num_inliers
         angle, along, known_along = np.full((3, len(count)), np.nan)
         is_wrong = np.zeros(len(count), np.bool_)
         poses: list[Floats | None] = [None] * len(count)

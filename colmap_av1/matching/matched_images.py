@@ -64,6 +64,11 @@ class MatchedImages(PairedImages):
     geometries: list[TwoViewGeometry]
     forward_motion: bool
 
+    @property
+    def num_inliers(self) -> Ints:
+        """Number of inlier matches of each pair, int64 [num_pairs]."""
+        return np.array([len(own.inlier_matches) for own in self.geometries], np.int64)
+
 
 def pair_images(
     name: str,
@@ -208,7 +213,7 @@ def _translation(geometry: TwoViewGeometry, camera: pycolmap.Camera) -> Floats |
 
 def used_pairs(matched: MatchedImages) -> tuple[Bools, Ints]:
     """Return which pairs mappers use, bool [m], and the inliers of each pair, int64 [m]."""
-    counts = np.array([len(g.inlier_matches) for g in matched.geometries], dtype=np.int64)
+    counts = matched.num_inliers
     configs = [geometry.config for geometry in matched.geometries]
     return (counts >= MIN_INLIERS) & ~np.isin(configs, UNUSED_CONFIGS), counts
 

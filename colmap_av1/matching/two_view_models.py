@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 import poselib
 import pycolmap
+from numpy.typing import NDArray
 
+from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.options import VerifyOptions
 from colmap_av1.options.matching import MIN_MATCHES
 from colmap_av1.util.arrays import Bools, Floats, Ints
@@ -375,6 +377,19 @@ def error_by_poses(
     focal = np.mean([camera.mean_focal_length() for camera in cameras])
     error = float(focal) * sampson_error(essential_of_poses(*poses), *rays)
     return np.asarray(error[np.isfinite(error)])
+
+
+def error_of_pixels(
+    views: Sequence[PosedCamera], xy: Sequence[NDArray[np.floating[Any]]]
+) -> Floats:
+    """The error of matches [n, 2] in pixels of two images, see `error_by_poses`."""
+    rays = [
+        np.asarray(view.camera.cam_from_img(own.astype(np.float64))).T
+        for view, own in zip(views, xy, strict=True)
+    ]
+    return error_by_poses(
+        [view.cam_from_world for view in views], [view.camera for view in views], rays
+    )
 
 
 def transfer_inliers(H: Floats, xa: Floats, xb: Floats, max_error: float) -> Bools:

@@ -15,9 +15,10 @@ from itertools import pairwise
 import numpy as np
 
 from colmap_av1.geometry.colmap_model import camera_centres
+from colmap_av1.geometry.coverage import views_of
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.matching.two_view_models import error_by_poses
+from colmap_av1.matching.two_view_models import error_of_pixels
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.grouping import with_equal_keys
 
@@ -84,16 +85,11 @@ def _shares_fitting(
     frame_of, poses = image_set.images.frame_of, model.by_name
 
     def share(names: tuple[str, str]) -> float | None:
-        views = [poses[name] for name in names]
-        cameras = [model.cameras[view.camera_id] for view in views]
         seen = with_equal_keys(track, *(by_frame[frame_of[name]] for name in names))
         if len(seen[0]) < _FEWEST:
             return None
-        rays = [
-            np.asarray(camera.cam_from_img(tracks.xy[own].astype(np.float64))).T
-            for camera, own in zip(cameras, seen, strict=True)
-        ]
-        error = error_by_poses([view.cam_from_world for view in views], cameras, rays)
+        views = views_of([poses[name] for name in names], model.cameras)
+        error = error_of_pixels(views, [tracks.xy[own] for own in seen])
         return float(np.mean(error <= _MAX_ERROR))
 
     return [share(seam) for seam in seams]

@@ -21,7 +21,7 @@ from colmap_av1.images.names import image_file, natural_order
 from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.sift import Features, extract_features, masked_features
 from colmap_av1.matching.links.matching import match_pairs
-from colmap_av1.matching.two_view_models import error_by_poses
+from colmap_av1.matching.two_view_models import error_of_pixels
 from colmap_av1.options import VerifyOptions
 from colmap_av1.util.arrays import Floats, Picture
 from colmap_av1.util.progress import Progress, no_progress
@@ -191,14 +191,9 @@ class LongRangeCheck:
 
     def _errors(self, i: int, j: int, xa: NDArray[np.floating], xb: NDArray[np.floating]) -> Floats:
         """Symmetric epipolar distance in pixels of matches [n, 2] by the poses of two images."""
-        cameras = [self._cameras[k] for k in (i, j)]
-        rays = [
-            np.asarray(camera.cam_from_img(xy.astype(np.float64))).T
-            for camera, xy in zip(cameras, (xa, xb), strict=True)
-        ]
-        poses = [self._images[k].cam_from_world for k in (i, j)]
+        views = [PosedCamera(self._cameras[k], self._images[k].cam_from_world) for k in (i, j)]
         # The Sampson error splits the distance between both images; sqrt(2) refers it to one.
-        return np.asarray(np.sqrt(2) * error_by_poses(poses, cameras, rays))
+        return np.asarray(np.sqrt(2) * error_of_pixels(views, (xa, xb)))
 
 
 def model_long_range_errors(

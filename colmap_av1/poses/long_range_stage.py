@@ -73,12 +73,12 @@ def long_range_stage(
 
     def make(_: Path) -> LongRangeResult:
         registered = read_posed_images(run, posed, image_set)
-        far = _compared(run, tracks, image_set, dynamic_masks, registered)
+        errors = _compared(run, tracks, image_set, dynamic_masks, registered)
         return LongRangeResult(
-            median=far.median,
-            largest=far.largest,
-            warning=far.warning(searched_loops=searched_loops),
-            contradicts_poses=far.contradicts_poses,
+            median=errors.median,
+            largest=errors.largest,
+            warning=errors.warning(searched_loops=searched_loops),
+            contradicts_poses=errors.contradicts_poses,
         )
 
     return run_stage(

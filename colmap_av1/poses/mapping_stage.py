@@ -212,7 +212,7 @@ def _why_no_model(found: MatchesResult, mapper: str, camera: CameraOptions) -> s
         return (
             f"{failure}: too few tracks, {found.keypoints_per_image:.0f} per image and "
             f"{found.num_verified_pairs} of {found.num_pairs} verified pairs: "
-            "'colmap-av1 info' tells what the stream lacks, --reencode 1 converts it again"
+            "see 'colmap-av1 info' for what the stream lacks, or convert it again with --reencode 1"
         )
     if found.assumes_focal_length:
         return (

@@ -66,16 +66,16 @@ class MatchesResult:
 
 def _write_links(folder: Path, found: ImageMatches) -> None:
     folder.mkdir()
-    contradicted = found.links.frames_of_gaps("contradicted")
-    broken = np.array([before for before, _ in contradicted], np.int32)
+    gaps = found.links.frames_of_gaps("contradicted")
+    contradicted = np.array([before for before, _ in gaps], np.int32)
     with (folder / _LINKS).open("wb") as file:
-        np.savez(file, **vars(found.link_tracks), broken=broken)
+        np.savez(file, **vars(found.link_tracks), contradicted=contradicted)
 
 
 def read_links(stages: Path) -> tuple[Tracks, NDArray[np.int32]]:
     """The links as tracks, and the frame before each contradicted gap, which no track crosses."""
     with np.load(stages / _LINKS) as file:
-        return tracks_of(file), file["broken"]
+        return tracks_of(file), file["contradicted"]
 
 
 def matches_key(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> list[Any]:

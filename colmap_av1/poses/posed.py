@@ -205,9 +205,9 @@ def trusted_tracks(
     run: Run, tracks: Sequence[Tracks], image_set: ImageSet
 ) -> tuple[Tracks, Tracks]:
     """The tracks of all videos, cut at gaps that links replace, and the links."""
-    links, broken = read_links(run.stages)
+    links, contradicted = read_links(run.stages)
     every = Tracks.in_sequence(tracks, image_set.num_frames)
-    return every.split_after_frames(broken.tolist()), links
+    return every.split_after_frames(contradicted.tolist()), links
 
 
 def _is_doubtful(posed: Posed) -> bool:
@@ -219,8 +219,8 @@ def _is_doubtful(posed: Posed) -> bool:
     if posed.adjustment is None:
         return False
     matches, adjusted = posed.matches.result, posed.adjustment.result
-    is_weak = adjusted.doubtful_seams or adjusted.scale_lost_seams or matches.assumes_focal_length
-    may_bend = (matches.links.gaps or matches.links.fast) and is_weak
+    uncertain = adjusted.doubtful_seams or adjusted.scale_lost_seams or matches.assumes_focal_length
+    may_bend = (matches.links.gaps or matches.links.fast) and uncertain
     return bool(adjusted.has_long_focal_length or may_bend)
 
 

@@ -298,7 +298,7 @@ def _points_of_loose_stretches(
     views: Ints,
     point: Ints,
 ) -> Ints:
-    """The number of points at each seam; at a weak one, at most those of the stretch beside it.
+    """The number of points at each seam; where it is low, at most those of the stretch beside it.
 
     Where images between two parts of a video are not registered, views on either side of them count
     as near. Both parts may be held together by such points, but not the images between the parts

@@ -188,8 +188,8 @@ def _away_from_masks(view: PosedCamera) -> Bools:
 
     if view.mask is None:
         return view.valid_cells
-    left_out = replace(view, mask=make_mask(~view.mask.kept)).valid_cells
-    return np.asarray(~binary_dilation(left_out, np.ones((3, 3))))
+    masked = replace(view, mask=make_mask(~view.mask.kept)).valid_cells
+    return np.asarray(~binary_dilation(masked, np.ones((3, 3))))
 
 
 def _squares(view: PosedCamera, cells: Bools, factor: int) -> Floats:

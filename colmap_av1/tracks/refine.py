@@ -115,10 +115,8 @@ def refine_spread_tracks(
     Raises:
         ImageError: as `refine_tracks`.
     """
-    in_image = np.zeros(tracks.num_frames, dtype=np.bool_)
-    in_image[frames] = True
-    observation = np.flatnonzero(in_image[tracks.frame])
-    seen = tracks.keep_observations(in_image[tracks.frame])
+    observation = np.flatnonzero(np.isin(tracks.frame, frames))
+    seen = tracks.keep_frames(frames)
     if len(observation) == 0:
         return tracks
     spread = spread_observations(seen, _SPREAD)

@@ -178,18 +178,18 @@ def digest_of(values: Iterable[Any], *, timed: bool = False) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _spell(value: Any, left_out: frozenset[str]) -> str:
+def _spell(value: Any, excluded: frozenset[str]) -> str:
     """The value as text that differs for different values."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kind = type(value).__name__
         names = (field.name for field in dataclasses.fields(value))
-        fields = {name: getattr(value, name) for name in names if f"{kind}.{name}" not in left_out}
-        return f"{kind}{_spell(fields, left_out)}"
+        fields = {name: getattr(value, name) for name in names if f"{kind}.{name}" not in excluded}
+        return f"{kind}{_spell(fields, excluded)}"
     if isinstance(value, dict):
-        items = sorted((_spell(k, left_out), _spell(v, left_out)) for k, v in value.items())
+        items = sorted((_spell(k, excluded), _spell(v, excluded)) for k, v in value.items())
         return f"{{{','.join(f'{k}:{v}' for k, v in items)}}}"
     if isinstance(value, (list, tuple)):
-        return f"[{','.join(_spell(v, left_out) for v in value)}]"
+        return f"[{','.join(_spell(v, excluded) for v in value)}]"
     if isinstance(value, os.PathLike):
         return repr(os.fspath(value))
     if value is None or type(value) in (bool, int, float, str):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def grouped(key: NDArray[np.integer[Any]], num_groups: int) -> tuple[Ints, Ints]
 def groups(key: NDArray[np.integer[Any]], num_groups: int) -> list[Ints]:
     """The indices of the elements of each group, see `grouped`."""
     order, bounds = grouped(key, num_groups)
-    return np.split(order, bounds[1:-1])
+    return [order[first:last] for first, last in pairwise(bounds.tolist())]
 
 
 def with_equal_keys(key: NDArray[np.integer[Any]], first: Ints, second: Ints) -> tuple[Ints, Ints]:

@@ -91,12 +91,12 @@ def test_invalid_positions_of_a_path_are_reported(clip: Path, tmp_path: Path) ->
 
     def of_gopro(body: bytes) -> tuple[int, str | None]:
         found = read_positions(read_file(with_gpmf(clip, tmp_path / "gopro.mp4", [(0.6, body)])))
-        return (len(found.times), found.left_out) if found is not None else (0, None)
+        return (len(found.times), found.ignored) if found is not None else (0, None)
 
     def of_drone(text: str) -> tuple[int, str | None]:
         srt.write_text(text)
         found = read_positions(read_file(video))
-        return (len(found.times), found.left_out) if found is not None else (0, None)
+        return (len(found.times), found.ignored) if found is not None else (0, None)
 
     count, warning = of_gopro(gps5(np.vstack([PLACES, wrong[:3]])))
     assert count == len(PLACES)
@@ -183,7 +183,7 @@ def test_positions_are_read_from_srt_files_and_subtitle_streams(
 def test_position_formats_of_drones(clip: Path, tmp_path: Path, text: str, place: object) -> None:
     found = positions_of(with_srt(clip, tmp_path, text))
     np.testing.assert_allclose(found.places, [place])
-    assert found.left_out is None
+    assert found.ignored is None
 
 
 @pytest.mark.parametrize(
@@ -213,11 +213,11 @@ def test_location_tag_of_the_video_decides_the_order(
     found = positions_of(with_srt(video, tmp_path, text))
     if place is None:
         assert len(found.times) == 0
-        assert found.left_out is not None
-        assert "unclear" in found.left_out
+        assert found.ignored is not None
+        assert "unclear" in found.ignored
     else:
         np.testing.assert_allclose(found.places, [place], atol=1e-5)
-        assert found.left_out is None
+        assert found.ignored is None
 
 
 def test_subtitles_may_start_after_the_video(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> None:

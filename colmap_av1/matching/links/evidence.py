@@ -88,9 +88,9 @@ def unbridged_gaps(
     wrong = sorted({frame for frame, _ in report.frames_of_gaps("contradicted")})
     is_wrong = np.isin(image_set.images.frames[:-1], wrong)
     across = np.zeros(len(suspect.maybe))
-    for (i, j), geometry in zip(matched.pairs.tolist(), matched.geometries, strict=True):
-        if j == i + 1:
-            across[i] = len(geometry.inlier_matches)
+    first, second = matched.pairs.T
+    neighbours = second == first + 1
+    across[first[neighbours]] = matched.num_inliers[neighbours]
     in_video = across[np.diff(image_set.sequence) == 0]
     usual = float(np.median(in_video)) if len(in_video) else 0.0
     enough = max(_SURE_INLIERS, _ENOUGH_OF_USUAL * usual)

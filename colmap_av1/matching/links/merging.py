@@ -27,9 +27,9 @@ def merge_links(
     matched: MatchedImages,
     links: Links,
     features: dict[int, Features],
-    left_out: Sequence[int],
+    dropped: Sequence[int],
 ) -> MatchedImages:
-    """Add linked features and their matches, and drop motion across the gaps `left_out`."""
+    """Add linked features and their matches, and drop motion across the gaps `dropped`."""
     used: dict[int, set[int]] = {}
     for (i, j), geometry in zip(links.pairs.tolist(), links.geometries, strict=True):
         used.setdefault(i, set()).update(geometry.inlier_matches[:, 0].tolist())
@@ -43,7 +43,7 @@ def merge_links(
         )
         num_tracks += len(indices)
     rows: dict[tuple[int, int], tuple[NDArray[np.uint32], TwoViewGeometry]] = {}
-    gap = np.array(left_out, dtype=np.int64)
+    gap = np.array(dropped, dtype=np.int64)
     for k, (i, j) in enumerate(matched.pairs.tolist()):
         if not np.any((i <= gap) & (gap < j)):
             rows[i, j] = matched.matches[k], matched.geometries[k]

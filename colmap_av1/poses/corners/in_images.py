@@ -68,7 +68,7 @@ def _followed(
             continue
         first = int(registered.first_frame[video])
         mask_of = {int(registered.frames[i]) - first: masks[i] for i in own}
-        guide = tracks.keep_observations(np.isin(tracks.frame, registered.frames[own]))
+        guide = tracks.keep_frames(registered.frames[own])
         num_frames = max(mask_of) + 1
         guide = replace(guide, frame=guide.frame - np.int32(first), num_frames=num_frames)
         decoded = run.shown[video].pictures(

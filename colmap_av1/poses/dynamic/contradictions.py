@@ -207,16 +207,16 @@ class Contradictions:
         hiding = self._hiding(agreeing)
         return hiding | self._seen_through(agreeing & ~hiding)
 
-    def unseen(self, left_out: Bools) -> Floats:
+    def unseen(self, excluded: Bools) -> Floats:
         """Count the agreeing points that project into each cell of images not observing them.
 
         Args:
-            left_out: bool [num_tracks] tracks that are not used as evidence.
+            excluded: bool [num_tracks] tracks that are not used as evidence.
 
         Returns:
             float64 [images, rows, columns].
         """
-        agreeing = self._agreeing & ~left_out & (self._tracks.lengths >= _LONG)
+        agreeing = self._agreeing & ~excluded & (self._tracks.lengths >= _LONG)
         found = np.zeros(self._tracks.shape)
         images = map_on_threads(self._shown, range(len(found)), self._num_threads)
         for own, shown in zip(found, images, strict=True):

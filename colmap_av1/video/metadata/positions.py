@@ -61,7 +61,7 @@ class Positions:
         stream: index of the stream of the video that holds times and places; None if another file
             holds them, or there are none.
         first_picture: time in seconds of the video's first picture, on the clock of players.
-        left_out: description of the data that is ignored; None if nothing is ignored.
+        ignored: description of the data that is ignored; None if nothing is ignored.
     """
 
     source: str
@@ -72,7 +72,7 @@ class Positions:
     gravity: Floats
     stream: int | None = None
     first_picture: float = 0.0
-    left_out: str | None = None
+    ignored: str | None = None
 
 
 def implausible_position(tags: tuple[tuple[str, str], ...]) -> str | None:
@@ -102,7 +102,7 @@ def read_positions(video: VideoFile) -> Positions | None:
         with open_container(video.path, apply_edits=True) as container:
             packets = _packets(container)
             found = _of_data(container, packets, start)
-            if found is None or found.left_out is not None:
+            if found is None or found.ignored is not None:
                 found = _of_subtitles(container, packets, start, place) or found
     srt_file = _srt_file(video.path)
     if srt_file is not None and (found is None or not (len(found.times) or len(found.gravity))):
@@ -148,8 +148,8 @@ def _of_srt_file(path: Path, place: tuple[float, float, float] | None) -> Positi
             found = _of_subtitles(container, _packets(container), 0.0, place)
     except VideoError:
         nothing = np.empty(0), np.empty((0, 3))
-        left_out = f"{path} {_UNKNOWN_FORMAT}"
-        return Positions(str(path), *nothing, None, *nothing, left_out=left_out)
+        ignored = f"{path} {_UNKNOWN_FORMAT}"
+        return Positions(str(path), *nothing, None, *nothing, ignored=ignored)
     return replace(found, source=str(path), stream=None) if found else None
 
 
@@ -227,10 +227,10 @@ def _of_data(container: Any, packets: dict[int, list[_Packet]], start: float) ->
     kept = are_places(places)
     held = np.linalg.norm(gravity, axis=1) > 0.5
     source = f"the GoPro track of {container.name}"
-    left_out = _left_out(source, places[~kept])
-    if not kept.any() and left_out is None and any(_has_receiver(p.content) for p in found):
-        left_out = f"{source} has no positions: the receiver had no fix, or the track is damaged"
-    if not kept.any() and not held.any() and left_out is None:
+    ignored = _message_of_ignored(source, places[~kept])
+    if not kept.any() and ignored is None and any(_has_receiver(p.content) for p in found):
+        ignored = f"{source} has no positions: the receiver had no fix, or the track is damaged"
+    if not kept.any() and not held.any() and ignored is None:
         return None
     return Positions(
         source,
@@ -238,7 +238,7 @@ def _of_data(container: Any, packets: dict[int, list[_Packet]], start: float) ->
         None,
         *_ascending(gravity_times[held], gravity[held]),
         stream=tracks[0],
-        left_out=left_out,
+        ignored=ignored,
     )
 
 
@@ -247,7 +247,7 @@ def _has_receiver(payload: bytes) -> bool:
     return any(key in payload for key in (b"GPS5", b"GPS9", b"GPSF"))
 
 
-def _left_out(source: str, refused: Floats, unreadable: int = 0) -> str | None:
+def _message_of_ignored(source: str, refused: Floats, unreadable: int = 0) -> str | None:
     """The message for ignored positions [n, 3]; None if there are only positions without a fix."""
     count = int((np.nan_to_num(refused[:, :2]) != 0).any(axis=1).sum()) + unreadable
     if count == 0:
@@ -300,16 +300,16 @@ def _of_texts(
     places, doubt = to_places([own for _, own in found], place)
     kept = are_places(places)
     if doubt is not None:
-        left_out: str | None = f"{source}: positions are ignored because it is unclear {doubt}"
+        ignored: str | None = f"{source}: positions are ignored because it is unclear {doubt}"
     elif found or not unreadable:
-        left_out = _left_out(source, places[~kept], unreadable)
+        ignored = _message_of_ignored(source, places[~kept], unreadable)
     else:
-        left_out = f"{source} {_UNKNOWN_FORMAT}"
-    if not kept.any() and left_out is None:
+        ignored = f"{source} {_UNKNOWN_FORMAT}"
+    if not kept.any() and ignored is None:
         return None
     nothing = np.empty(0), np.empty((0, 3))
     path = _ascending(times[kept], places[kept])
-    return Positions(source, *path, None, *nothing, stream=stream, left_out=left_out)
+    return Positions(source, *path, None, *nothing, stream=stream, ignored=ignored)
 
 
 def _ascending(times: Floats, values: Floats) -> tuple[Floats, Floats]:
