@@ -6,11 +6,12 @@ import os
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 
 from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_of_videos
 from colmap_av1.database.reading import DatabaseImage, read_images
@@ -32,7 +33,7 @@ from colmap_av1.images.track_images import MIN_IMAGES
 from colmap_av1.matching.cameras import ImageCameras, new_cameras
 from colmap_av1.matching.few_matches import matching_warning
 from colmap_av1.matching.gaps import fast_frames
-from colmap_av1.matching.initial_pairs import prepare_start
+from colmap_av1.matching.initial_pairs import PreparedStart, prepare_start
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.mapper_limits import FORWARD_MOTION, SMALL_ANGLES
 from colmap_av1.matching.match_images import (
@@ -40,7 +41,7 @@ from colmap_av1.matching.match_images import (
     SelectedTracks,
     match_images,
 )
-from colmap_av1.matching.matched_images import PairedImages
+from colmap_av1.matching.matched_images import MatchedImages, PairedImages
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter
 from colmap_av1.options import (
     DensifyOptions,
@@ -61,7 +62,7 @@ from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import check_outside, scratch_folder
-from colmap_av1.util.progress import Progress, no_progress
+from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
@@ -290,24 +291,16 @@ def match(
         # The estimate does not change the cameras of an existing database.
         is_undetermined = cameras is None and joint is not None and is_assumed
         is_known_ahead = start.limits == FORWARD_MOTION and not is_assumed
-        fixed_intrinsics = is_known_ahead or is_undetermined
-        of_images = found.cameras
-        if is_undetermined:  # the mapper keeps the assumed intrinsics only if they count as known
-            of_images = with_known_focal_lengths(of_images)
-        written = start.matched
         names = images.image_set.images.names
-        crash = None
-        try:
-            # Without depth, there is no good start.
-            if found.depth.is_observable and not start.is_tried:
-                written = demote_failing_starts(
-                    start, names, found.cameras, clock, fixed_intrinsics=fixed_intrinsics
-                )
-        except ModelError:
-            crash = (
-                "COLMAP's mapper failed in a trial on this database, and may fail again: if so, "
-                "its output tells why"
-            )
+        begun = _begin_mapper(
+            start,
+            names,
+            found,
+            clock,
+            fixed_intrinsics=is_known_ahead,
+            is_undetermined=is_undetermined,
+        )
+        written = begun.matched
         num_written, blurred = 0, list[str]()
         if folder is not None:
             check_videos()
@@ -323,7 +316,7 @@ def match(
         write_matches(
             database,
             names,
-            None if listed else of_images,
+            None if listed else begun.cameras,
             written,
             on_existing=options.on_existing,
             places=positions.places,
@@ -333,7 +326,7 @@ def match(
     num_inliers = written.num_inliers
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
     notes += (*positions.warnings, *found.warnings)
-    doubts = [crash, found.depth.warning, focal_length_warning(found.cameras)]
+    doubts = [begun.warning, found.depth.warning, focal_length_warning(found.cameras)]
     # Few matches do not mean a gap if existing matches of the database may connect the images, or
     # with a joint estimate, which omits matches that only repeat tracks of other pairs.
     if options.on_existing != "append" and joint is None:
@@ -358,13 +351,13 @@ def match(
         focal_length=found.focal_length,
         read_outs=tuple(own.tracked.video.read_out for own in videos),
         num_pairs=len(written.geometries),
-        num_verified_pairs=sum(count > 0 for count in num_inliers),
+        num_verified_pairs=int(np.count_nonzero(num_inliers)),
         num_matches=sum(len(matches) for matches in written.matches),
-        num_inliers=sum(num_inliers),
+        num_inliers=int(num_inliers.sum()),
         configs=dict(sorted(kinds.items())),
         forward_motion=start.limits == FORWARD_MOTION,
         small_angles=start.limits == SMALL_ANGLES,
-        fixed_intrinsics=fixed_intrinsics,
+        fixed_intrinsics=begun.fixed_intrinsics,
         links=found.links,
         estimate=joint.estimate if joint is not None else None,
         seconds=clock.seconds,
@@ -539,6 +532,76 @@ def _match_images(
         return found
     warning = f"matches are verified pair by pair, without a joint estimate: {reason}"
     return replace(found, warnings=(*found.warnings, warning))
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """Matches from which COLMAP's incremental mapper begins well, as far as trials show.
+
+    Attributes:
+        matched: the images with their matches.
+        cameras: the camera of each image.
+        fixed_intrinsics: see `MatchReport`.
+        warning: a problem with the mapper or the cameras; None if there is none.
+    """
+
+    matched: MatchedImages
+    cameras: Sequence[pycolmap.Camera]
+    fixed_intrinsics: bool
+    warning: str | None = None
+
+
+def _begin_mapper(
+    start: PreparedStart,
+    names: Sequence[str],
+    found: ImageMatches,
+    clock: Clock,
+    *,
+    fixed_intrinsics: bool,
+    is_undetermined: bool,
+) -> _Begun:
+    """Demote pairs with which the mapper would start a small model.
+
+    If the joint estimate does not determine the intrinsics, the mapper refines the assumed ones if
+    it begins well so, and otherwise keeps them.
+
+    Args:
+        start: the images, and the mapper's limits of the initial pair.
+        names: names of the images.
+        found: the matches and cameras.
+        clock: gets the stage "verification".
+        fixed_intrinsics: whether the mapper keeps the intrinsics.
+        is_undetermined: whether the joint estimate does not determine the intrinsics.
+    """
+    cameras, known = found.cameras, with_known_focal_lengths(found.cameras)
+    # Without depth, there is no good start.
+    is_tried = start.is_tried or not found.depth.is_observable
+    if is_undetermined:
+        refined = None
+        if found.depth.is_observable:
+            with suppress(ModelError):
+                refined = demote_failing_starts(start, names, cameras, clock, is_assumed=True)
+        if refined is not None:
+            return _Begun(refined, cameras, fixed_intrinsics=False)
+        # The mapper keeps the assumed intrinsics only if they count as known.
+        cameras, fixed_intrinsics = known, True
+    assumed = (
+        "the images hardly determine the focal length, so the mapper keeps a default that may be "
+        "far off: give the intrinsics by --camera_params if you know them"
+    )
+    warning = assumed if is_undetermined else None
+    try:
+        matched = None
+        if not is_tried:
+            matched = demote_failing_starts(
+                start, names, known, clock, fixed_intrinsics=fixed_intrinsics
+            )
+    except ModelError:
+        warning = (
+            "COLMAP's mapper failed in a trial on this database, and may fail again: if so, its "
+            "output tells why"
+        )
+    return _Begun(matched or start.matched, cameras, fixed_intrinsics, warning)
 
 
 def _has_assumed_focal_length(found: ImageMatches) -> bool:

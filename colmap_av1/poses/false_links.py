@@ -4,7 +4,9 @@ False links, for example between two doors that look alike, may place the images
 they do not belong. The model is then bent although many points join its parts. The tracks across
 the seam show it: bundle adjustment has dropped them because they contradict the poses. Without
 tracks, the speed of the camera shows it: at the wrong one of two doors, it has moved much further
-than it can have moved in the images that are lost at the seam.
+than it can have moved in the images that are lost at the seam. In a turn, motion may follow the
+epipolar lines of wrong poses. Where the camera leaps, the points of one side of the seam are
+therefore compared with the tracks in the image on the other side.
 """
 
 from __future__ import annotations
@@ -17,8 +19,10 @@ import numpy as np
 from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.coverage import views_of
 from colmap_av1.geometry.posed_model import PosedModel
+from colmap_av1.geometry.track_points import triangulate_tracks
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.two_view_models import error_of_pixels
+from colmap_av1.poses.posed_images import FOR_POSES
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.grouping import with_equal_keys
 
@@ -27,13 +31,20 @@ _MAX_ERROR = 4.0
 # A seam is contradicted if fewer than this share of its tracks fit. On 17 rendered walks, 9 % fit
 # at a seam where false links bent the model, and 59 % or more at all others.
 _LEAST_FITTING = 0.4
-# Fewer tracks show nothing.
+# Fewer tracks or points show nothing.
 _FEWEST = 30
 # A camera moves too fast across a seam if its speed exceeds this multiple of the speed that it
 # hardly ever exceeds elsewhere in the video. On 21 rendered walks, it was 2.2 where false links
 # bent the model, and at most 0.54 at other seams without tracks and with few points.
 _TOO_FAST = 1.5
 _HARDLY_EVER = 0.9  # a quantile
+# A camera leaps if it is this much faster. On 12 rendered walks, it was 8.3 times as fast where a
+# model of few images was bent in a turn, and at most 1.7 times elsewhere.
+_LEAP = 3.0
+# Smallest number of images on one side that observe a point.
+_FEWEST_VIEWS = 3
+# Number of images on one side of a seam whose points are compared with the image on the other.
+_NEAR = 10
 
 
 def contradicted_seams(
@@ -73,6 +84,54 @@ def jumping_seams(
         for seam, share in zip(seams, shares, strict=True)
         if share is None and speeds[seam] > _TOO_FAST
     ]
+
+
+def leaping_seams(model: PosedModel, image_set: ImageSet) -> list[tuple[str, str]]:
+    """The neighbouring images of a video between which the camera leaps, by their names."""
+    return [seam for seam, speed in _relative_speeds(model, image_set).items() if speed > _LEAP]
+
+
+def misplaced_seams(
+    model: PosedModel, image_set: ImageSet, tracks: Tracks, seams: Sequence[tuple[str, str]]
+) -> list[tuple[str, str]]:
+    """The seams at which most points of one side do not project to their tracks on the other.
+
+    Args:
+        model: the poses.
+        image_set: all images.
+        tracks: the tracks of all videos.
+        seams: names of the images before and after each seam.
+    """
+    frame_of = image_set.images.frame_of
+    images = sorted(model.images, key=lambda image: frame_of[image.name])
+    frames = np.array([frame_of[image.name] for image in images], np.int32)
+    views = views_of(images, model.cameras)
+
+    def fits(side: range, other: int) -> bool:
+        near = tracks.keep_frames(np.append(frames[side], frames[other]))
+        near = near.keep_tracks(near.having(near.frame == frames[other]))
+        near = near.keep_tracks(near.lengths > _FEWEST_VIEWS)
+        found = triangulate_tracks(
+            near, frames[side], [views[k] for k in side], options=FOR_POSES, num_threads=None
+        )
+        first = found.points.observation[found.points.offsets[:-1]]
+        at = near.xy[near.frame == frames[other]][found.tracks.track[first]]
+        local = views[other].in_camera(found.points.xyz)
+        error = np.linalg.norm(views[other].pixels(local) - at, axis=1)
+        is_near = (local[:, 2] > 0) & (error <= _MAX_ERROR)
+        return len(error) < _FEWEST or float(np.mean(is_near)) >= _LEAST_FITTING
+
+    index = {image.name: k for k, image in enumerate(images)}
+    video = image_set.sequence[np.searchsorted(image_set.images.frames, frames)]
+    found = []
+    for seam in seams:
+        last, first = (index[name] for name in seam)
+        before = range(max(last + 1 - _NEAR, int(np.searchsorted(video, video[last]))), last + 1)
+        end = int(np.searchsorted(video, video[first], side="right"))
+        after = range(first, min(first + _NEAR, end))
+        if not (fits(before, first) and fits(after, last)):
+            found.append(seam)
+    return found
 
 
 def _shares_fitting(

@@ -16,7 +16,6 @@ import numpy as np
 import pycolmap
 
 from colmap_av1.database.writing import write_matches
-from colmap_av1.geometry.cameras import with_known_focal_lengths
 from colmap_av1.matching.initial_pairs import PreparedStart, are_far, with_demoted
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS
 from colmap_av1.matching.matched_images import MatchedImages
@@ -28,6 +27,8 @@ from colmap_av1.util.progress import Clock
 # A start has succeeded with this number of images, or with half of all images. It is the least
 # number that COLMAP's mapper requires of a model, except of the first (min_model_size).
 _NUM_IMAGES = 10
+# The same if the focal length is assumed: this number, or this share of all images.
+_NUM_ASSUMED, _MOST = 30, 0.9
 # Fewest images of a model that can be judged.
 _LEAST_IMAGES = 3
 # Largest number of starts that are tried.
@@ -41,7 +42,8 @@ def demote_failing_starts(
     clock: Clock,
     *,
     fixed_intrinsics: bool = False,
-) -> MatchedImages:
+    is_assumed: bool = False,
+) -> MatchedImages | None:
     """Limit the inliers of pairs with which COLMAP's incremental mapper starts a small model.
 
     The mapper runs with one thread and the seed 0, with the options that `match` prints. If no pair
@@ -51,33 +53,34 @@ def demote_failing_starts(
     Args:
         start: the images, and the mapper's limits.
         names: names of the images.
-        cameras: the camera of each image.
+        cameras: the camera of each image. COLMAP 4.2 may crash if a focal length is not known.
         clock: gets the stage "verification".
-        fixed_intrinsics: whether `match` prints that the mapper keeps the intrinsics.
+        fixed_intrinsics: whether the mapper keeps the intrinsics.
+        is_assumed: whether the focal length is a default, which may diverge late: then a start
+            needs more images.
 
     Returns:
-        The images with fewer inliers; the given ones if no trial succeeds.
+        The images with fewer inliers; None if no trial succeeds.
 
     Raises:
         ModelError: the mapper stopped.
     """
-    most = np.unique(start.matched.pairs).size // 2
-    num_images = max(_LEAST_IMAGES, min(_NUM_IMAGES, most))
+    count = np.unique(start.matched.pairs).size
+    enough = min(_NUM_ASSUMED, round(_MOST * count)) if is_assumed else min(_NUM_IMAGES, count // 2)
+    num_images = max(_LEAST_IMAGES, enough)
     options = MapOptions(
         mapper="incremental",
         refine_intrinsics=not fixed_intrinsics,
         seed=0,
         num_threads=1,
     )
-    # COLMAP 4.2 crashes on some pairs when it estimates the focal length.
-    known = with_known_focal_lengths(cameras)
     lower = vars(DEFAULT_LIMITS.relaxed[1]) if not start.is_certain else {}
     initial_pair = {**lower, **start.limits.options}
 
     def failing_start(matched: MatchedImages) -> list[str] | None:
         with tempfile.TemporaryDirectory() as folder:
             database, log = Path(folder) / "matches.db", Path(folder) / "log"
-            write_matches(database, names, known, matched)
+            write_matches(database, names, cameras, matched)
             return start_mapper(database, options, num_images, log=log, initial_pair=initial_pair)
 
     with clock.measure("verification"):
@@ -88,7 +91,7 @@ def _without_failing_starts(
     matched: MatchedImages,
     names: Sequence[str],
     failing_start: Callable[[MatchedImages], list[str] | None],
-) -> MatchedImages:
+) -> MatchedImages | None:
     """Demote the pairs of small first models until a trial succeeds.
 
     Args:
@@ -97,7 +100,7 @@ def _without_failing_starts(
         failing_start: runs the mapper, see `start_mapper`.
 
     Returns:
-        The images with fewer inliers; the given ones if no trial succeeds.
+        The images with fewer inliers; None if no trial succeeds.
     """
     found = matched
     for _ in range(_MAX_TRIALS):
@@ -113,7 +116,7 @@ def _without_failing_starts(
         if changed is None:
             break  # the next trial would be the same
         found = changed
-    return matched
+    return None
 
 
 def _demoted(matched: MatchedImages, which: Bools) -> MatchedImages | None:

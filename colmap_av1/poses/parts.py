@@ -29,7 +29,7 @@ from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
 from colmap_av1.geometry.uncertainty import MAX_CERTAIN_ERROR, MAX_IMAGES, centre_uncertainty
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.adjustment_stage import AdjustedResult
-from colmap_av1.poses.false_links import contradicted_seams, jumping_seams
+from colmap_av1.poses.false_links import contradicted_seams, jumping_seams, misplaced_seams
 from colmap_av1.poses.mapping_stage import MappedResult
 from colmap_av1.poses.posed_images import read_poses
 from colmap_av1.poses.run import Run
@@ -61,6 +61,7 @@ def split_stage(
     adjusted: Kept[AdjustedResult],
     seams: Sequence[tuple[str, str]],
     *,
+    leaps: Sequence[tuple[str, str]],
     tracks: Tracks,
     whole: Tracks,
     rival: Kept[AdjustedResult] | None,
@@ -76,6 +77,7 @@ def split_stage(
         mapped: the models of the mapper.
         adjusted: the first of these, adjusted.
         seams: names of the images before and after each seam where it may be split.
+        leaps: the same for seams where it is split only if points contradict the poses.
         tracks: the tracks of all videos.
         whole: these tracks before earlier splits, which cut them at all seams.
         rival: see `Posed`.
@@ -88,8 +90,10 @@ def split_stage(
 
     def parts(known: PosedModel) -> list[AbstractSet[str]]:
         other = read_poses(run, rival) if rival is not None else None
-        false = contradicted_seams(known, image_set, tracks, seams)
-        found = parts_of(known, image_set, seams, false=false, rival=other)
+        misplaced = misplaced_seams(known, image_set, tracks, leaps)
+        false = [*contradicted_seams(known, image_set, tracks, seams), *misplaced]
+        every = sorted({*seams, *misplaced})
+        found = parts_of(known, image_set, every, false=false, rival=other)
         if len(found[0]) < len(known.images):
             return found
         # Only if nothing else splits the model: a split and another adjustment may remove the
@@ -97,9 +101,9 @@ def split_stage(
         jumping = jumping_seams(known, image_set, whole, adjusted.result.few_point_seams)
         if not jumping:
             return found
-        return parts_of(known, image_set, seams, false=[*false, *jumping], rival=other)
+        return parts_of(known, image_set, every, false=[*false, *jumping], rival=other)
 
-    key = [list(seams), rival.digest if rival is not None else None]
+    key = [list(seams), list(leaps), rival.digest if rival is not None else None]
     return _parts_stage(run, mapped, adjusted, parts, name=f"parts_{number}", key=key)
 
 

@@ -341,16 +341,22 @@ def split_at_seams(
     for number in count(_FIRST_SPLIT):
         if posed.adjustment is None:
             break
-        seams, num_images = posed.seams_to_split, posed.adjustment.result.num_registered
+        adjusted = posed.adjustment.result
+        seams, leaps, num_images = (
+            posed.seams_to_split,
+            adjusted.leaping_seams,
+            adjusted.num_registered,
+        )
         may_bend |= bool(seams)
         parts = None
-        if seams:
+        if seams or leaps:
             parts = split_stage(
                 run,
                 image_set,
                 posed.mapped,
                 posed.adjustment,
                 seams,
+                leaps=leaps,
                 tracks=posed.tracks,
                 whole=whole,
                 rival=posed.rival,
@@ -359,14 +365,14 @@ def split_at_seams(
         if parts is None or parts.result.num_registered == num_images:
             if not may_bend:
                 break
-            seams = []
+            seams, leaps = [], ()
             parts = certain_stage(run, image_set, posed.mapped, posed.adjustment, number=number)
             if parts.result.num_registered == num_images:
                 break
         if parts.result.num_registered == 0:
             return replace(posed, mapped=parts) if only_certain else posed
         frame_of = image_set.images.frame_of
-        frames = [frame_of[first] for first, _ in seams]
+        frames = [frame_of[first] for first, _ in (*seams, *leaps)]
         posed = replace(
             posed,
             mapped=parts,

@@ -17,7 +17,12 @@ from colmap_av1.geometry.colmap_model import ModelImage, read_model
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.false_links import contradicted_seams, jumping_seams
+from colmap_av1.poses.false_links import (
+    contradicted_seams,
+    jumping_seams,
+    leaping_seams,
+    misplaced_seams,
+)
 from colmap_av1.poses.parts import certain_parts, parts_of
 from colmap_av1.poses.track_matches import tracks_of_model
 from colmap_av1.reconstruct import reconstruct
@@ -158,6 +163,25 @@ def test_a_camera_that_is_too_fast_at_a_seam_shows_false_links(jump: int, is_fal
     seams = [(image_set.images.names[9], image_set.images.names[10])]
     nothing = Tracks.empty(24, (640, 480))
     assert jumping_seams(known, every, nothing, seams) == (seams if is_false else [])
+
+
+@pytest.mark.parametrize("is_true", [True, False])
+def test_a_leap_is_false_if_points_do_not_project_to_their_tracks(is_true: bool) -> None:
+    image_set = images(12)
+    views = [[k, k + 1, k + 2, k + 3] for k in range(9) for _ in range(40)]
+    still = model(image_set, views)
+    leaps = replace(
+        still, images=[replace(i, cam_from_world=i.cam_from_world.copy()) for i in still.images]
+    )
+    for image in leaps.images[6:]:
+        image.cam_from_world[0, 3] -= 8
+    depths = [10.0] * len(views)
+    tracks = tracks_of_model(seen_at(leaps if is_true else still, depths), image_set)
+    seams = leaping_seams(leaps, image_set)
+    assert seams == [seam(image_set, 5)]
+    assert misplaced_seams(leaps, image_set, tracks, seams) == ([] if is_true else seams)
+    nothing = Tracks.empty(12, (640, 480))
+    assert misplaced_seams(leaps, image_set, nothing, seams) == []
 
 
 def test_another_video_joins_parts() -> None:
