@@ -576,6 +576,24 @@ def test_focal_length_that_a_short_clip_does_not_determine_is_kept(
 
 
 @pytest.mark.shared
+def test_mapper_refines_a_default_focal_length_if_it_begins_well_so(
+    street: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("colmap_av1.poses.joint_cameras.FOCAL_LENGTH_ERROR", 0.0)
+    report = match(tmp_path / "a.db", street(20), image_path=tmp_path / "frames")
+    assert report.focal_length is None
+    assert not report.fixed_intrinsics
+    (row,) = tables(tmp_path / "a.db")["cameras"]
+    assert row[5] == 0
+    options = replace(report.map_options, num_threads=1)
+    mapped = map_database(
+        tmp_path / "a.db", tmp_path / "frames", tmp_path / "models", options=options
+    )
+    assert mapped.num_registered[0] == 20
+    assert mapped.figures.focal_lengths == pytest.approx((707, 707), rel=0.15)
+
+
+@pytest.mark.shared
 def test_drive_with_unknown_intrinsics_is_mapped(street: Street, tmp_path: Path) -> None:
     report = match(tmp_path / "a.db", street(20), image_path=tmp_path / "frames")
     assert report.estimate is not None

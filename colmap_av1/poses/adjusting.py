@@ -39,6 +39,12 @@ _FEWEST_KEPT = 8
 # The covariance of intrinsics is estimated from at most this number of images and about this number
 # of observations of each, whose standard deviation in pixels is assumed.
 _COVARIANCE_IMAGES, _COVARIANCE_OBSERVATIONS, _OBSERVATION_ERROR = 200, 100, 0.25
+# A focal length is determined if its relative standard deviation is below this. On walks with turns
+# the standard deviation is 0.5 % and the true error 0.1 to 0.3 %; on a straight drive they are 1.3
+# to 5 % and 1 to 2 %; in clips of seven or eight frames, where the focal length diverges, 36 to
+# 45 %. With the adjusted focal length, COLMAP's mapper registers all images of the drive; with the
+# assumed one, 5 of 51.
+FOCAL_LENGTH_ERROR = 0.1
 # An image must observe this many points to stay registered, as COLMAP's mapper requires, or this
 # share of the median if that is less. An image filled by a pillar observed 8 where others observed
 # 300 or more, and its pose error was 300 times theirs.

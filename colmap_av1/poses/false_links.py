@@ -96,6 +96,9 @@ def misplaced_seams(
 ) -> list[tuple[str, str]]:
     """The seams at which most points of one side do not project to their tracks on the other.
 
+    Seams whose tracks contradict the epipolar geometry are not examined: at a true leap, encoders
+    find false motion.
+
     Args:
         model: the poses.
         image_set: all images.
@@ -124,7 +127,10 @@ def misplaced_seams(
     index = {image.name: k for k, image in enumerate(images)}
     video = image_set.sequence[np.searchsorted(image_set.images.frames, frames)]
     found = []
-    for seam in seams:
+    shares = _shares_fitting(model, image_set, tracks, seams)
+    for seam, share in zip(seams, shares, strict=True):
+        if share is None or share < _LEAST_FITTING:
+            continue
         last, first = (index[name] for name in seam)
         before = range(max(last + 1 - _NEAR, int(np.searchsorted(video, video[last]))), last + 1)
         end = int(np.searchsorted(video, video[first], side="right"))

@@ -116,7 +116,7 @@ def further_poses(
             )
             if map_again:
                 posed = remapped_poses(own, posed, some, least_kept=_LEAST_KEPT)
-            posed = split_at_seams(own, posed, some, only_certain=True)
+            posed = split_at_seams(own, posed, some, is_further=True)
         except ModelError:  # too few tracks agree with these poses
             posed = None
         used = set[str]()

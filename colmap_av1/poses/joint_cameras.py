@@ -14,14 +14,8 @@ from colmap_av1.database.listed import listed_cameras
 from colmap_av1.database.reading import read_images
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.adjusting import focal_length_errors, refines_intrinsics
+from colmap_av1.poses.adjusting import FOCAL_LENGTH_ERROR, focal_length_errors, refines_intrinsics
 from colmap_av1.poses.run import Run
-
-# A focal length is determined if its relative standard deviation is below this. On walks with turns
-# the standard deviation is 0.5 % and the true error 0.1 to 0.3 %; on a straight drive they are 1.3
-# and 7 %. With the adjusted focal length, COLMAP's mapper registers all images of the drive; with
-# the assumed one, 5 of 51.
-_FOCAL_LENGTH_ERROR = 0.03
 
 # The adjusted camera of each of some images, by the index of the image.
 _CameraOfImage = dict[int, pycolmap.Camera]
@@ -126,6 +120,6 @@ def _determined(run: Run, models: Sequence[PosedModel], cameras: AbstractSet[int
             determined |= {
                 id(camera)
                 for number, camera in model.cameras.items()
-                if errors[number] < _FOCAL_LENGTH_ERROR
+                if errors[number] < FOCAL_LENGTH_ERROR
             }
     return determined

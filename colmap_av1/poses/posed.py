@@ -260,6 +260,7 @@ def _adjusted(
         masks_digest=posed.masks_digest,
         has_picture_positions=posed.has_picture_positions,
         is_fast=bool(posed.matches.result.links.fast),
+        is_assumed=posed.matches.result.assumes_focal_length,
         number=number,
     )
 
@@ -313,7 +314,7 @@ def refined_poses(
 
 
 def split_at_seams(
-    run: Run, posed: Posed, image_set: ImageSet, *, only_certain: bool = False
+    run: Run, posed: Posed, image_set: ImageSet, *, is_further: bool = False
 ) -> Posed:
     """Split the model at seams with few points, and adjust the largest part separately.
 
@@ -323,30 +324,29 @@ def split_at_seams(
     may be wrong there. Links are: without them, a part that returns to a place would fall apart.
 
     Images of a model with such seams are also removed if their positions are uncertain, see
-    `certain_parts`.
+    `certain_parts`. Further models, which pictures far apart do not check, are also split where the
+    camera leaps against their points, see `misplaced_seams`.
 
     Args:
         run: the run.
         posed: the adjusted poses.
         image_set: the images.
-        only_certain: remove images with uncertain positions even if there are no such seams.
+        is_further: the model is not the first: images with uncertain positions are removed even if
+            there are no such seams.
 
     Returns:
         The poses of the largest part. If too few of its images are certain, it is returned with all
-        of them; with `only_certain`, its mapped model then has no images, and the poses of the
+        of them; with `is_further`, its mapped model then has no images, and the poses of the
         other stages must not be used.
     """
-    may_bend = only_certain
+    may_bend = is_further
     whole = posed.tracks
     for number in count(_FIRST_SPLIT):
         if posed.adjustment is None:
             break
         adjusted = posed.adjustment.result
-        seams, leaps, num_images = (
-            posed.seams_to_split,
-            adjusted.leaping_seams,
-            adjusted.num_registered,
-        )
+        seams, num_images = posed.seams_to_split, adjusted.num_registered
+        leaps = adjusted.leaping_seams if is_further else ()
         may_bend |= bool(seams)
         parts = None
         if seams or leaps:
@@ -370,7 +370,7 @@ def split_at_seams(
             if parts.result.num_registered == num_images:
                 break
         if parts.result.num_registered == 0:
-            return replace(posed, mapped=parts) if only_certain else posed
+            return replace(posed, mapped=parts) if is_further else posed
         frame_of = image_set.images.frame_of
         frames = [frame_of[first] for first, _ in (*seams, *leaps)]
         posed = replace(
