@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,6 +43,7 @@ from colmap_av1.poses.placing.up import some_spread, vertical_lines
 from colmap_av1.util.arrays import Floats
 from colmap_av1.util.files import check_new_folder, whole_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.texts import some_names
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ def map_database(
             found = check_model(model, database=database)
     warnings = (
         *place_warnings,
-        _missing(checked.num_images, num_registered),
+        _missing(database, posed_images(model), num_registered),
         checked.depth.warning,
         focal_length_warning(posed_model(model).cameras.values()),
         # Seams of the model are more specific than gaps of the matches.
@@ -266,12 +267,18 @@ def _uncertain_models(output: Path, num_models: int) -> list[str]:
     return [f"few points with parallax determine the camera positions of {', '.join(uncertain)}"]
 
 
-def _missing(num_images: int, num_registered: Sequence[int]) -> str | None:
+def _missing(
+    database: Path, registered: Collection[str], num_registered: Sequence[int]
+) -> str | None:
     """A warning about images that the largest model lacks, or about further models."""
     largest, *others = num_registered
+    names = [image.name for image in read_images(database)]
+    num_images = len(names)
     if not others:
-        missing = num_images - largest
-        return f"{missing} of {num_images} images are not registered" if missing else None
+        missing = [name for name in names if name not in registered]
+        if not missing:
+            return None
+        return f"{len(missing)} of {num_images} images are not registered: {some_names(missing)}"
     further = ", ".join(f"'{number}' has {size}" for number, size in enumerate(others, start=1))
     if largest == num_images:
         return f"model '0' has all {num_images} images, {further} of them again: ignore the others"

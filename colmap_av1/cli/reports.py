@@ -59,6 +59,9 @@ def match_rows(report: MatchReport) -> Rows:
     ]
     if report.estimate is not None:
         rows += _estimate_rows(report.estimate, report.num_images)
+        name, words = _focal_length_row(report.estimate.focal_lengths)
+        is_estimated = report.focal_length is not None
+        rows.append((name, words if is_estimated else f"{words}, not estimated"))
     elif report.focal_length is not None:
         rows.append(("focal length", f"{report.focal_length:.1f} px, estimated"))
     if report.forward_motion:
@@ -77,7 +80,6 @@ def _estimate_rows(estimate: JointEstimate, num_images: int) -> Rows:
         ("joint estimate", f"{registered} of {num_images} images registered"),
         *_dynamic_row(estimate.dynamic_share),
         *_long_range_rows(estimate.long_range, estimate.long_range_largest),
-        _focal_length_row(estimate.focal_lengths),
     ]
 
 

@@ -32,12 +32,15 @@ from colmap_av1.images.recognising import check_content, frames_by_content, fram
 from colmap_av1.options import ImageOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats, Ints, Picture
+from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.texts import read_lines, some_names
 
 # Yields (frame number, picture) of some frames, given by their numbers, in order; None: all. Frames
 # are numbered as players show them, from 0.
 _Decode = Callable[[Collection[int] | None], Iterable[tuple[int, Picture]]]
 
+# Number of existing images whose content is checked.
+_NUM_CHECKED = 8
 # Added to times in ticks, which are rational numbers. At half the frame rate of a video, every
 # other time lies halfway between two ticks.
 _ROUNDING = 1e-6
@@ -188,7 +191,7 @@ def choose_images(
                     f"{way} chooses other images than the {len(existing)} that exist: leave it out"
                     f"{other}"
                 )
-            _check_ends(chosen, folder, decode)
+            _check_some(chosen, folder, decode)
     if len(chosen.frames) < 2:
         remedy = "add images of other frames" if existing else "choose more frames"
         if num_frames < 2:
@@ -367,23 +370,20 @@ def _find_existing(
                 ) from error
             return _by_content(by_name, files, decode)
         chosen = _in_order(by_name, frames)
-    _check_ends(chosen, folder, decode)
+    _check_some(chosen, folder, decode)
     return chosen
 
 
-def _check_ends(chosen: ChosenImages, folder: Path | None, decode: _Decode) -> None:
-    """Check the content of the first and the last image that are in a folder.
-
-    They show a wrong start or rate.
-    """
+def _check_some(chosen: ChosenImages, folder: Path | None, decode: _Decode) -> None:
+    """Check the content of some images that are in a folder, including the first and the last."""
     if folder is None:
         return
     files = [image_file(folder, name) for name in chosen.names]
     there = [k for k, file in enumerate(files) if file.exists()]
-    if there:
-        ends = sorted({there[0], there[-1]})
-        frames = chosen.frames[ends].tolist()
-        check_content([files[k] for k in ends], frames, decode(frames_near(frames)))
+    some = [there[k] for k in evenly_spread(len(there), _NUM_CHECKED)]
+    if some:
+        frames = chosen.frames[some].tolist()
+        check_content([files[k] for k in some], frames, decode(frames_near(frames)))
 
 
 def _keep_images_of_model(chosen: ChosenImages, names: Sequence[str]) -> ChosenImages:

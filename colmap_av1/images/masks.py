@@ -296,7 +296,13 @@ def _read_mask(path: Path) -> Mask:
         raise ImageError(f"{path}: cannot be read as a mask: {_LAYOUTS}")
     if picture.ndim == 3:
         # COLMAP ignores transparency, too.
-        picture = picture[:, :, :3].any(axis=2)
+        kept = picture[:, :, :3].any(axis=2)
+        if picture.shape[2] == 4 and kept.all() and np.ptp(picture[:, :, 3]) > 0:
+            raise ImageError(
+                f"{path}: has its mask in the alpha channel, which is ignored: save it in grey, "
+                "black where pixels are excluded"
+            )
+        picture = kept
     return make_mask(picture > 0)
 
 

@@ -123,7 +123,7 @@ def writing_stages(output: Path) -> Iterator[None]:
             raise  # An input cannot be read.
         raise WriteError(
             f"{output}: cannot be written: {error.strerror or error}: fix that and run the same "
-            "command again, finished stages are kept"
+            "command again"
         ) from error
 
 

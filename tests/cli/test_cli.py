@@ -55,14 +55,12 @@ def test_match_command(clip: Path, tmp_path: Path) -> None:
     make_folder, mapper = table["next"].split(" && ")
     assert shlex.split(make_folder) == ["mkdir", "-p", "a_model"]
     assert shlex.split(mapper)[:2] == ["colmap", "mapper"]
-    # The clip is too short to determine the focal length.
     assert shlex.split(mapper)[2:] == [
         *("--database_path", "a.db", "--image_path", "my frames", "--output_path", "a_model"),
-        *("--Mapper.ba_refine_focal_length", "0", "--Mapper.ba_refine_extra_params", "0"),
     ]
     assert shlex.split(table["or"]) == [
         *("colmap-av1", "map", "--database", "a.db", "--image_path", "my frames"),
-        *("--output", "a_model", "--refine_intrinsics", "0"),
+        *("--output", "a_model"),
     ]
     assert shlex.split(table["then, for splats"]) == [
         *("colmap-av1", "densify", "--model", "a_model/0", "--video", str(clip)),

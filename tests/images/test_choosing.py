@@ -278,7 +278,10 @@ def test_folder_of_another_video_is_refused(
     assert len(list(folder.iterdir())) == 3
     # The number of images is right, but one is missing and another one exists twice.
     folder = save(tmp_path / "odd", [*cut[:4], *cut[5:], cut[2]])
-    with pytest.raises(ImageError, match=r"x15\.png"):
+    with pytest.raises(ImageError, match=r"x\d+\.png"):
+        match(tmp_path / "a.db", clip, image_path=folder)
+    folder = save(tmp_path / "middle", [*cut[:4], *cut[5:12], cut[11], *cut[12:]])
+    with pytest.raises(ImageError, match=r"x\d+\.png"):
         match(tmp_path / "a.db", clip, image_path=folder)
 
 
@@ -385,7 +388,7 @@ def test_content_is_checked_if_images_are_missing(
     pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE)
     (folder / "x1.png").unlink()
     before = database.read_bytes()
-    with pytest.raises(ImageError, match="frame 10"):
+    with pytest.raises(ImageError, match="should show frame 4"):
         match(database, clip, image_path=folder, options=_every(2))
     with pytest.raises(ImageError, match=r"x1\.png"):
         match(database, clip, image_path=folder, options=DENSE)

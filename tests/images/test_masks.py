@@ -132,6 +132,13 @@ def test_only_black_pixels_are_excluded(
     assert all(np.array_equal(found[name], xy) for name, xy in whole.items())
 
 
+def test_a_mask_in_the_alpha_channel_is_refused(clip: Path, tmp_path: Path) -> None:
+    white = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+    white[..., 3] = LEFT
+    with pytest.raises(ImageError, match="alpha"):
+        match(tmp_path / "a.db", clip, options=options(write(tmp_path / "rgba.png", white)))
+
+
 def test_links_use_no_features_on_masks(encode: Encode, tmp_path: Path) -> None:
     """SIFT features at gaps in the motion respect the masks."""
     frames = make_frames(12)
