@@ -108,9 +108,8 @@ class MatchReport:
         small_angles: the joint estimate shows that the mapper needs a lower limit of the
             triangulation angle to begin with a pair from which a large model grows.
         fixed_intrinsics: the mapper should not refine focal length and distortion, because they
-            are known and the camera moves along its axis, or because the joint estimate shows that
-            the images hardly determine them. They may diverge otherwise, so that few images
-            register.
+            are known and the camera moves along its axis, or because the images do not determine
+            them and few register if they are refined.
         links: SIFT links between images that motion does not connect.
         estimate: summary of the joint estimate of all poses that matches were verified against;
             None if they were verified pair by pair.
