@@ -37,11 +37,7 @@ from colmap_av1.images.of_videos import VideoImages, images_of_videos
 from colmap_av1.images.photos import Photo
 from colmap_av1.images.track_images import ImageChoice, TrackedImages, track_chosen_images
 from colmap_av1.options import DensifyOptions
-from colmap_av1.splats.gaussians import (
-    check_gaussians_path,
-    initial_gaussians,
-    write_gaussians,
-)
+from colmap_av1.splats.gaussians import check_gaussians_path, initial_gaussians, write_gaussians
 from colmap_av1.splats.swept_cloud import Look, swept_cloud
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import open_source

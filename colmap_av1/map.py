@@ -15,13 +15,7 @@ from colmap_av1.check.model import check_model
 from colmap_av1.check.model_figures import ModelFigures
 from colmap_av1.database.file import copy_database
 from colmap_av1.database.reading import read_images, read_pose_priors
-from colmap_av1.errors import (
-    DatabaseError,
-    ImageError,
-    ModelError,
-    OptionError,
-    writing,
-)
+from colmap_av1.errors import DatabaseError, ImageError, ModelError, OptionError, writing
 from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.colmap_model import MODEL_FILES, posed_images, read_model
 from colmap_av1.geometry.posed_model import posed_model
@@ -33,12 +27,7 @@ from colmap_av1.options import MapOptions, PlaceOptions
 from colmap_av1.options.place import parse_distance
 from colmap_av1.poses.long_range import LongRangeErrors
 from colmap_av1.poses.mapper import map_poses
-from colmap_av1.poses.placing.placement import (
-    Place,
-    Surroundings,
-    find_placement,
-    write_place,
-)
+from colmap_av1.poses.placing.placement import Place, Surroundings, find_placement, write_place
 from colmap_av1.poses.placing.up import some_spread, vertical_lines
 from colmap_av1.util.arrays import Floats
 from colmap_av1.util.files import check_new_folder, whole_folder

@@ -36,11 +36,7 @@ from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.initial_pairs import PreparedStart, prepare_start
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.mapper_limits import FORWARD_MOTION, SMALL_ANGLES
-from colmap_av1.matching.match_images import (
-    ImageMatches,
-    SelectedTracks,
-    match_images,
-)
+from colmap_av1.matching.match_images import ImageMatches, SelectedTracks, match_images
 from colmap_av1.matching.matched_images import MatchedImages, PairedImages
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter
 from colmap_av1.options import (
@@ -109,7 +105,7 @@ class MatchReport:
             triangulation angle to begin with a pair from which a large model grows.
         fixed_intrinsics: the mapper should not refine focal length and distortion, because they
             are known and the camera moves along its axis, or because the images do not determine
-            them and few register if they are refined.
+            them, and no large model grows in a trial if they are refined.
         links: SIFT links between images that motion does not connect.
         estimate: summary of the joint estimate of all poses that matches were verified against;
             None if they were verified pair by pair.
@@ -288,18 +284,20 @@ def match(
         known = joint.poses if joint is not None and not is_assumed else ()
         start = prepare_start(found.matched, found.cameras, clock, known)
         # The estimate does not change the cameras of an existing database.
-        is_undetermined = cameras is None and joint is not None and is_assumed
+        undetermined_in = None
+        if cameras is None and joint is not None and is_assumed:
+            undetermined_in = joint.estimate.num_registered[0]
         is_known_ahead = start.limits == FORWARD_MOTION and not is_assumed
         names = images.image_set.images.names
-        begun = _begin_mapper(
+        started = _start_mapper(
             start,
             names,
             found,
             clock,
             fixed_intrinsics=is_known_ahead,
-            is_undetermined=is_undetermined,
+            undetermined_in=undetermined_in,
         )
-        written = begun.matched
+        written = started.matched
         num_written, blurred = 0, list[str]()
         if folder is not None:
             check_videos()
@@ -315,7 +313,7 @@ def match(
         write_matches(
             database,
             names,
-            None if listed else begun.cameras,
+            None if listed else started.cameras,
             written,
             on_existing=options.on_existing,
             places=positions.places,
@@ -325,7 +323,7 @@ def match(
     num_inliers = written.num_inliers
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
     notes += (*positions.warnings, *found.warnings)
-    doubts = [begun.warning, found.depth.warning, focal_length_warning(found.cameras)]
+    doubts = [started.warning, found.depth.warning, focal_length_warning(found.cameras)]
     # Few matches do not mean a gap if existing matches of the database may connect the images, or
     # with a joint estimate, which omits matches that only repeat tracks of other pairs.
     if options.on_existing != "append" and joint is None:
@@ -356,7 +354,7 @@ def match(
         configs=dict(sorted(kinds.items())),
         forward_motion=start.limits == FORWARD_MOTION,
         small_angles=start.limits == SMALL_ANGLES,
-        fixed_intrinsics=begun.fixed_intrinsics,
+        fixed_intrinsics=started.fixed_intrinsics,
         links=found.links,
         estimate=joint.estimate if joint is not None else None,
         seconds=clock.seconds,
@@ -534,8 +532,8 @@ def _match_images(
 
 
 @dataclass(frozen=True)
-class _Begun:
-    """Matches from which COLMAP's incremental mapper begins well, as far as trials show.
+class _MapperStart:
+    """What COLMAP's incremental mapper starts from.
 
     Attributes:
         matched: the images with their matches.
@@ -550,19 +548,19 @@ class _Begun:
     warning: str | None = None
 
 
-def _begin_mapper(
+def _start_mapper(
     start: PreparedStart,
     names: Sequence[str],
     found: ImageMatches,
     clock: Clock,
     *,
     fixed_intrinsics: bool,
-    is_undetermined: bool,
-) -> _Begun:
-    """Demote pairs with which the mapper would start a small model.
+    undetermined_in: int | None,
+) -> _MapperStart:
+    """Choose pairs, cameras and fixed intrinsics so that the mapper starts a large model.
 
-    If the joint estimate does not determine the intrinsics, the mapper refines the assumed ones if
-    it begins well so, and otherwise keeps them.
+    If the joint estimate does not determine the intrinsics, the mapper refines the default ones if
+    a large model then grows, and otherwise keeps them.
 
     Args:
         start: the images, and the mapper's limits of the initial pair.
@@ -570,27 +568,28 @@ def _begin_mapper(
         found: the matches and cameras.
         clock: gets the stage "verification".
         fixed_intrinsics: whether the mapper keeps the intrinsics.
-        is_undetermined: whether the joint estimate does not determine the intrinsics.
+        undetermined_in: number of images of the largest model of the joint estimate, if that does
+            not determine the intrinsics; else None.
     """
     cameras, known = found.cameras, with_known_focal_lengths(found.cameras)
     # Without depth, there is no good start.
     is_tried = start.is_tried or not found.depth.is_observable
-    if is_undetermined:
-        refined = None
-        if found.depth.is_observable:
+    matched = warning = None
+    if undetermined_in is not None:
+        if not is_tried:
             with suppress(ModelError):
-                refined = demote_failing_starts(start, names, cameras, clock, is_assumed=True)
-        if refined is not None:
-            return _Begun(refined, cameras, fixed_intrinsics=False)
-        # The mapper keeps the assumed intrinsics only if they count as known.
+                matched = demote_failing_starts(
+                    start, names, cameras, clock, num_assumed=undetermined_in
+                )
+            if matched is not None:
+                return _MapperStart(matched, cameras, fixed_intrinsics=False)
+            warning = (
+                "the images hardly determine the focal length, so the mapper keeps a default that "
+                "may be far off: give the intrinsics by --camera_params if you know them"
+            )
+        # The mapper keeps the default intrinsics only if they count as known.
         cameras, fixed_intrinsics = known, True
-    assumed = (
-        "the images hardly determine the focal length, so the mapper keeps a default that may be "
-        "far off: give the intrinsics by --camera_params if you know them"
-    )
-    warning = assumed if is_undetermined else None
     try:
-        matched = None
         if not is_tried:
             matched = demote_failing_starts(
                 start, names, known, clock, fixed_intrinsics=fixed_intrinsics
@@ -600,7 +599,7 @@ def _begin_mapper(
             "COLMAP's mapper failed in a trial on this database, and may fail again: if so, its "
             "output tells why"
         )
-    return _Begun(matched or start.matched, cameras, fixed_intrinsics, warning)
+    return _MapperStart(matched or start.matched, cameras, fixed_intrinsics, warning)
 
 
 def _has_assumed_focal_length(found: ImageMatches) -> bool:

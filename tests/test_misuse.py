@@ -14,12 +14,7 @@ from typing import Any
 import pytest
 from conftest import PROJECT
 
-from colmap_av1 import (
-    ReadOptions,
-    TrackOptions,
-    build_tracks,
-    read_motion,
-)
+from colmap_av1 import ReadOptions, TrackOptions, build_tracks, read_motion
 from colmap_av1.errors import BitstreamError, OptionError, VideoError
 from colmap_av1.motion import reading
 from colmap_av1.video.container import open_stream

@@ -10,11 +10,7 @@ import numpy as np
 import pycolmap
 
 from colmap_av1.database.file import open_unaltered
-from colmap_av1.database.reading import (
-    image_ids_from_pair_id,
-    keypoints_from_row,
-    matches_from_row,
-)
+from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_row, matches_from_row
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.colmap_model import ModelImage, posed_images
 from colmap_av1.matching.mapper_limits import MIN_INLIERS

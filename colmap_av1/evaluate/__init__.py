@@ -3,11 +3,7 @@
 from colmap_av1.check.model_figures import ModelFigures, model_figures
 from colmap_av1.evaluate.frontends.footage import Footage, choose_footage
 from colmap_av1.evaluate.frontends.frontend import Frontend, FrontendRun, run_frontend
-from colmap_av1.evaluate.frontends.mapping import (
-    MapperRun,
-    densify_model,
-    measure_mapper,
-)
+from colmap_av1.evaluate.frontends.mapping import MapperRun, densify_model, measure_mapper
 from colmap_av1.evaluate.frontends.measure import Measured, run_measured
 from colmap_av1.evaluate.frontends.registry import make_frontends
 from colmap_av1.evaluate.metrics.poses import PoseErrors, pose_errors

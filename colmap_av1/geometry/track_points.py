@@ -130,7 +130,7 @@ def triangulate_tracks(
     Args:
         tracks: the tracks.
         frames: int32 [num_images] the frame of each image.
-        views: the images.
+        views: the images, at least one.
         options: which points.
         num_threads: number of threads; None: one per CPU.
         pinholes: pinhole cameras in whose pixels errors are measured; None: pinhole cameras with

@@ -18,10 +18,7 @@ import cv2
 import numpy as np
 
 from colmap_av1.errors import ImageError, VideoError, writing
-from colmap_av1.images.names import (
-    image_file,
-    pattern_regex,
-)
+from colmap_av1.images.names import image_file, pattern_regex
 from colmap_av1.options.images import IMAGE_EXTENSIONS, check_extension
 from colmap_av1.util.arrays import Picture
 from colmap_av1.util.files import may_read, remove_leftovers, whole_file
@@ -297,7 +294,7 @@ def write_images(
 def _pictures(
     decoded: Iterable[tuple[int, Picture]], wanted: Collection[int]
 ) -> Iterator[tuple[int, Picture]]:
-    """Yield the wanted ones of decoded frames, which must have one size."""
+    """Yield decoded frames up to the last wanted one, which must have one size."""
     size: tuple[int, ...] | None = None
     last = max(wanted)
     for index, picture in decoded:

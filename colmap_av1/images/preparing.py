@@ -9,12 +9,7 @@ from pathlib import Path
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.blur import blur_warning
 from colmap_av1.images.choosing import check_frame_list, existing_images
-from colmap_av1.images.files import (
-    check_image_folder,
-    check_images_there,
-    image_size,
-    write_images,
-)
+from colmap_av1.images.files import check_image_folder, check_images_there, image_size, write_images
 from colmap_av1.images.masks import VideoMasks
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.orientation import ShownImages, shown_images

@@ -7,11 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pycolmap
 
-from colmap_av1.matching.mapper_limits import (
-    MIN_INLIERS,
-    POINT_MIN_ANGLE,
-    REGISTRATION_MIN_INLIERS,
-)
+from colmap_av1.matching.mapper_limits import MIN_INLIERS, POINT_MIN_ANGLE, REGISTRATION_MIN_INLIERS
 from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.util.arrays import Bools, Floats
 from colmap_av1.util.graphs import connected_components

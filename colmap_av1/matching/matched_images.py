@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -112,10 +111,10 @@ def pair_images(
     return PairedImages(keypoints, pairs, matches)
 
 
-def nothing_to_match(video: Path | str, options: PairOptions) -> VideoError:
+def nothing_to_match(name: str, options: PairOptions) -> VideoError:
     """The error to raise if no two images have enough matches."""
     return VideoError(
-        f"{video}: no two images share {options.min_matches} tracks, so there is nothing to "
+        f"{name}: no two images share {options.min_matches} tracks, so there is nothing to "
         "match: use more frames as images, or see 'colmap-av1 info --video' for what the stream "
         "lacks; --reencode 1 converts it first"
     )

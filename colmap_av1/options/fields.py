@@ -58,9 +58,34 @@ class Declared:
     unused: frozenset[str] = frozenset()
 
 
-def option(default: _Value, help: str, **how: Any) -> _Value:
-    """Declare a field of an options dataclass; `how` are further fields of `Declared`."""
-    return dataclasses.field(default=default, metadata={_DECLARED: Declared(help, **how)})
+def option(
+    default: _Value,
+    help: str,
+    *,
+    least: float | None = None,
+    most: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+    unit: str = "",
+    among: tuple[int, ...] = (),
+    common: bool = False,
+    spellings: tuple[str, ...] = (),
+    colmap: str = "",
+) -> _Value:
+    """Declare a field of an options dataclass, see `Declared`."""
+    declared = Declared(
+        help,
+        least,
+        most,
+        above,
+        below,
+        unit,
+        among,
+        common=common,
+        spellings=spellings,
+        colmap=colmap,
+    )
+    return dataclasses.field(default=default, metadata={_DECLARED: declared})
 
 
 def part(default: _Value, *, unused: Collection[str] = ()) -> _Value:

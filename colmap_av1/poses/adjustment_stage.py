@@ -154,7 +154,7 @@ def adjustment_stage(
             adjusted = adjust_posed(run, model, iterative=iterative)
             is_long = any(map(has_long_focal_length, adjusted.model.cameras.values()))
             if is_assumed and refine and not is_long:
-                adjusted = _converged(run, adjusted)
+                adjusted = _converged(run, adjusted, iterative=iterative)
             run.progress("adjustment", 1, 1)
             trimmed = without_unseen_images(adjusted.model)
         names = image_set.images.names
@@ -198,10 +198,15 @@ def adjustment_stage(
     )
 
 
-def _converged(run: Run, adjusted: Adjusted) -> Adjusted:
+def _converged(run: Run, adjusted: Adjusted, *, iterative: bool) -> Adjusted:
     """A model adjusted further if it then determines all focal lengths; else the given one."""
     further = adjust_posed(
-        run, adjusted.model, max_steps=_ASSUMED_STEPS, tolerance=_ASSUMED_TOLERANCE
+        run,
+        adjusted.model,
+        log="focal_length.log",
+        max_steps=_ASSUMED_STEPS,
+        tolerance=_ASSUMED_TOLERANCE,
+        iterative=iterative,
     )
     if max(focal_length_errors(further.model).values()) >= FOCAL_LENGTH_ERROR:
         return adjusted

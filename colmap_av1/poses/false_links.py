@@ -5,8 +5,9 @@ they do not belong. The model is then bent although many points join its parts. 
 the seam show it: bundle adjustment has dropped them because they contradict the poses. Without
 tracks, the speed of the camera shows it: at the wrong one of two doors, it has moved much further
 than it can have moved in the images that are lost at the seam. In a turn, motion may follow the
-epipolar lines of wrong poses. Where the camera leaps, the points of one side of the seam are
-therefore compared with the tracks in the image on the other side.
+epipolar lines of wrong poses, so tracks fit although the poses are wrong. Where the camera leaps,
+the points of each side of the seam are therefore compared with their tracks in the image on the
+other side.
 """
 
 from __future__ import annotations
@@ -92,18 +93,24 @@ def leaping_seams(model: PosedModel, image_set: ImageSet) -> list[tuple[str, str
 
 
 def misplaced_seams(
-    model: PosedModel, image_set: ImageSet, tracks: Tracks, seams: Sequence[tuple[str, str]]
+    model: PosedModel,
+    image_set: ImageSet,
+    tracks: Tracks,
+    seams: Sequence[tuple[str, str]],
+    *,
+    num_threads: int | None = None,
 ) -> list[tuple[str, str]]:
-    """The seams at which most points of one side do not project to their tracks on the other.
+    """The seams at which most points of either side do not project to their tracks on the other.
 
-    Seams whose tracks contradict the epipolar geometry are not examined: at a true leap, encoders
-    find false motion.
+    Seams with few tracks are not examined, and neither are those whose tracks contradict the
+    epipolar geometry: at a true leap, encoders find false motion.
 
     Args:
         model: the poses.
         image_set: all images.
         tracks: the tracks of all videos.
         seams: names of the images before and after each seam.
+        num_threads: number of threads; None: one per CPU.
     """
     frame_of = image_set.images.frame_of
     images = sorted(model.images, key=lambda image: frame_of[image.name])
@@ -115,7 +122,7 @@ def misplaced_seams(
         near = near.keep_tracks(near.having(near.frame == frames[other]))
         near = near.keep_tracks(near.lengths > _FEWEST_VIEWS)
         found = triangulate_tracks(
-            near, frames[side], [views[k] for k in side], options=FOR_POSES, num_threads=None
+            near, frames[side], [views[k] for k in side], options=FOR_POSES, num_threads=num_threads
         )
         first = found.points.observation[found.points.offsets[:-1]]
         at = near.xy[near.frame == frames[other]][found.tracks.track[first]]

@@ -37,12 +37,7 @@ from colmap_av1.poses.matched_observations import (
     matched_observations,
 )
 from colmap_av1.poses.posed import Posed
-from colmap_av1.poses.posed_images import (
-    PosedImages,
-    posed_images_of,
-    read_poses,
-    triangulate_in,
-)
+from colmap_av1.poses.posed_images import PosedImages, posed_images_of, read_poses, triangulate_in
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_matches import at_same_place, pair_by_tracks, tracks_of_model
 from colmap_av1.poses.track_stage import VideoTracks, pose_tracks

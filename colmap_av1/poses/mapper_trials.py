@@ -27,8 +27,9 @@ from colmap_av1.util.progress import Clock
 # A start has succeeded with this number of images, or with half of all images. It is the least
 # number that COLMAP's mapper requires of a model, except of the first (min_model_size).
 _NUM_IMAGES = 10
-# The same if the focal length is assumed: this number, or this share of all images.
-_NUM_ASSUMED, _MOST = 30, 0.9
+# If the focal length is a default, it has succeeded with this number of images, or with this share
+# of the largest model if that is less.
+_NUM_ASSUMED, _ASSUMED_SHARE = 30, 0.9
 # Fewest images of a model that can be judged.
 _LEAST_IMAGES = 3
 # Largest number of starts that are tried.
@@ -42,7 +43,7 @@ def demote_failing_starts(
     clock: Clock,
     *,
     fixed_intrinsics: bool = False,
-    is_assumed: bool = False,
+    num_assumed: int | None = None,
 ) -> MatchedImages | None:
     """Limit the inliers of pairs with which COLMAP's incremental mapper starts a small model.
 
@@ -56,8 +57,8 @@ def demote_failing_starts(
         cameras: the camera of each image. COLMAP 4.2 may crash if a focal length is not known.
         clock: gets the stage "verification".
         fixed_intrinsics: whether the mapper keeps the intrinsics.
-        is_assumed: whether the focal length is a default, which may diverge late: then a start
-            needs more images.
+        num_assumed: number of images of the largest model if the focal length is a default, which
+            may diverge late: a start then needs more images. None: it is not a default.
 
     Returns:
         The images with fewer inliers; None if no trial succeeds.
@@ -65,8 +66,10 @@ def demote_failing_starts(
     Raises:
         ModelError: the mapper stopped.
     """
-    count = np.unique(start.matched.pairs).size
-    enough = min(_NUM_ASSUMED, round(_MOST * count)) if is_assumed else min(_NUM_IMAGES, count // 2)
+    if num_assumed is not None:
+        enough = min(_NUM_ASSUMED, round(_ASSUMED_SHARE * num_assumed))
+    else:
+        enough = min(_NUM_IMAGES, np.unique(start.matched.pairs).size // 2)
     num_images = max(_LEAST_IMAGES, enough)
     options = MapOptions(
         mapper="incremental",

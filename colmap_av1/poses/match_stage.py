@@ -15,12 +15,7 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.cameras import ImageCameras, new_cameras
 from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.links.report import LinkReport
-from colmap_av1.matching.match_images import (
-    ImageMatches,
-    SelectedTracks,
-    match_images,
-    pair_videos,
-)
+from colmap_av1.matching.match_images import ImageMatches, SelectedTracks, match_images, pair_videos
 from colmap_av1.matching.matched_images import PairedImages
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.options import DensityOptions

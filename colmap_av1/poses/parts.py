@@ -90,9 +90,12 @@ def split_stage(
 
     def parts(known: PosedModel) -> list[AbstractSet[str]]:
         other = read_poses(run, rival) if rival is not None else None
-        misplaced = misplaced_seams(known, image_set, tracks, leaps)
+        num_threads = run.context.num_threads
+        misplaced = misplaced_seams(known, image_set, tracks, leaps, num_threads=num_threads)
         false = [*contradicted_seams(known, image_set, tracks, seams), *misplaced]
         every = sorted({*seams, *misplaced})
+        if not every:
+            return [set(known.by_name)]
         found = parts_of(known, image_set, every, false=false, rival=other)
         if len(found[0]) < len(known.images):
             return found

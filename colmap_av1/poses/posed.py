@@ -23,14 +23,10 @@ from colmap_av1.poses.dynamic.stage import (
     without_dynamic_tracks,
 )
 from colmap_av1.poses.long_range_stage import LongRangeResult, long_range_stage
-from colmap_av1.poses.mapping_stage import (
-    MappedResult,
-    mapping_stage,
-    with_model_first,
-)
+from colmap_av1.poses.mapping_stage import MappedResult, mapping_stage, with_model_first
 from colmap_av1.poses.match_stage import MatchesResult, match_stage, read_links
 from colmap_av1.poses.parts import certain_stage, split_stage
-from colmap_av1.poses.posed_images import PosesResult
+from colmap_av1.poses.posed_images import PosesResult, read_poses
 from colmap_av1.poses.remapping import remap_stage
 from colmap_av1.poses.resection_stage import resection_stage
 from colmap_av1.poses.run import Run
@@ -260,7 +256,7 @@ def _adjusted(
         masks_digest=posed.masks_digest,
         has_picture_positions=posed.has_picture_positions,
         is_fast=bool(posed.matches.result.links.fast),
-        is_assumed=posed.matches.result.assumes_focal_length,
+        is_assumed=posed.matches.result.assumes_focal_length and number == 1,
         number=number,
     )
 
@@ -331,8 +327,8 @@ def split_at_seams(
         run: the run.
         posed: the adjusted poses.
         image_set: the images.
-        is_further: the model is not the first: images with uncertain positions are removed even if
-            there are no such seams.
+        is_further: the model is not the first: leaps are tested, and images with uncertain
+            positions are removed even if there are no such seams.
 
     Returns:
         The poses of the largest part. If too few of its images are certain, it is returned with all
@@ -372,7 +368,9 @@ def split_at_seams(
         if parts.result.num_registered == 0:
             return replace(posed, mapped=parts) if is_further else posed
         frame_of = image_set.images.frame_of
-        frames = [frame_of[first] for first, _ in (*seams, *leaps)]
+        kept = read_poses(run, parts).by_name.keys()
+        cut = [*seams, *(leap for leap in leaps if not kept >= {*leap})]
+        frames = [frame_of[first] for first, _ in cut]
         posed = replace(
             posed,
             mapped=parts,

@@ -14,22 +14,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.coverage import (
-    CELL,
-    PosedCamera,
-    nearest_in_cells,
-    squares_of_cells,
-)
+from colmap_av1.geometry.coverage import CELL, PosedCamera, nearest_in_cells, squares_of_cells
 from colmap_av1.geometry.masks import make_mask
 from colmap_av1.geometry.model_points import ModelPoints
-from colmap_av1.splats.ray_search import (
-    LEAST_OTHERS,
-    Grey,
-    Swept,
-    shrinking,
-    smaller,
-    sweep_image,
-)
+from colmap_av1.splats.ray_search import LEAST_OTHERS, Grey, Swept, shrinking, smaller, sweep_image
 from colmap_av1.util.arrays import Bools, Floats
 from colmap_av1.util.grouping import groups
 from colmap_av1.util.spread import evenly_spread

@@ -11,21 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.errors import (
-    BitstreamError,
-    ImageError,
-    VideoError,
-    WriteError,
-    cannot_write,
-)
+from colmap_av1.errors import BitstreamError, ImageError, VideoError, WriteError, cannot_write
 from colmap_av1.motion.frame_motion import FrameMotion
 from colmap_av1.motion.info import Structure, read_info
-from colmap_av1.motion.reading import (
-    count_with_repeats,
-    first_showings,
-    frame_times,
-    read_motion,
-)
+from colmap_av1.motion.reading import count_with_repeats, first_showings, frame_times, read_motion
 from colmap_av1.options import (
     EncodeOptions,
     MatchOptions,

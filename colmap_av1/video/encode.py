@@ -251,6 +251,7 @@ def stream_of(
     output = Path(keep_stream)
     if output.suffix.lower() not in _KEPT_FORMATS:
         raise OptionError(f"{output}: give a file that ends in {', '.join(_KEPT_FORMATS)}")
+    file = read_file(video)
     if output.exists():
         if not may_read(output):
             raise OptionError(f"{output}: no permission to read it: change its permissions")
@@ -265,7 +266,7 @@ def stream_of(
             readable = int(mark.get("readable", 0))
             if kept and not (strict and readable):
                 if readable:
-                    file, _ = counted(read_file(video))
+                    file, _ = counted(file)
                     _warn_of_damage(file, readable, f"{output} ends there")
                 return EncodeReport(output, ENCODERS[mark["encoder"]].ffmpeg_name, kept, True)
     if not os.access(output.resolve().parent, os.W_OK | os.X_OK):

@@ -22,12 +22,7 @@ from colmap_av1.video.container import open_stream
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.unchanged import unchanged
-from colmap_av1.view.pictures import (
-    bgr,
-    existing_pictures,
-    open_pictures,
-    side_by_side,
-)
+from colmap_av1.view.pictures import bgr, existing_pictures, open_pictures, side_by_side
 
 # Side in pixels of the units in which motion is drawn.
 _UNIT = 4

@@ -12,12 +12,7 @@ from image_sets import tracks_from
 from numpy.typing import NDArray
 
 from colmap_av1.matching.few_matches import few_match_gaps, few_matches_warning
-from colmap_av1.matching.gaps import (
-    Gap,
-    low_inter_frames,
-    low_inter_gaps,
-    should_examine_pictures,
-)
+from colmap_av1.matching.gaps import Gap, low_inter_frames, low_inter_gaps, should_examine_pictures
 from colmap_av1.options import LinkOptions
 
 NUM_IMAGES = 30

@@ -13,10 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from colmap_av1 import ReconstructOptions
-from colmap_av1.geometry.colmap_model import (
-    ModelImage,
-    camera_centres,
-)
+from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import ImageSet

@@ -24,12 +24,7 @@ from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, make_mask
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.track_points import TriangulatedTracks
-from colmap_av1.geometry.triangulation import (
-    Observations,
-    TriangulatedPoints,
-    Views,
-    triangulate,
-)
+from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import ShownVideo, number_images
 from colmap_av1.images.masks import mask_tracks
@@ -391,6 +386,11 @@ def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         )
         off.append(np.linalg.norm(xy[0] - tracks.xy[row + 1]))
     return before, np.array(off)
+
+
+def test_nothing_is_followed_in_a_video_without_registered_images(passed: Passed) -> None:
+    others = replace(passed.registered, sequence=np.ones_like(passed.registered.sequence))
+    assert follow_behind(passed.run, passed.moving, passed.tracks, others).num_tracks == 0
 
 
 def test_tracks_continue_behind_a_passing_object(passed: Passed) -> None:

@@ -11,11 +11,7 @@ from image_sets import images
 
 from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
-from colmap_av1.poses.mapping_stage import (
-    MappedResult,
-    num_nearest,
-    with_model_first,
-)
+from colmap_av1.poses.mapping_stage import MappedResult, num_nearest, with_model_first
 from colmap_av1.poses.run import Run
 from colmap_av1.util.stages import Kept
 

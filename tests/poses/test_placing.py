@@ -13,13 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from colmap_av1.database.reading import PosePrior
 from colmap_av1.errors import OptionError
-from colmap_av1.geometry.alignment import (
-    PathFit,
-    Up,
-    east_north_up,
-    fit_path,
-    transform_poses,
-)
+from colmap_av1.geometry.alignment import PathFit, Up, east_north_up, fit_path, transform_poses
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.options.place import PlaceOptions, parse_distance
 from colmap_av1.poses.placing.distance import model_distance

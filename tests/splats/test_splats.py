@@ -15,12 +15,7 @@ from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.coverage import PosedCamera, coverage
 from colmap_av1.geometry.distant_points import splat_points
 from colmap_av1.geometry.model_points import ModelPoints
-from colmap_av1.geometry.triangulation import (
-    Observations,
-    TriangulatedPoints,
-    Views,
-    triangulate,
-)
+from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.options import TriangulateOptions
 from colmap_av1.splats.cloud import splat_cloud
 

@@ -21,12 +21,7 @@ from colmap_av1.errors import OptionError, VideoError
 from colmap_av1.match import match
 from colmap_av1.motion.info import read_info
 from colmap_av1.motion.reading import read_motion
-from colmap_av1.options import (
-    CameraOptions,
-    DensityOptions,
-    MatchOptions,
-    VerifyOptions,
-)
+from colmap_av1.options import CameraOptions, DensityOptions, MatchOptions, VerifyOptions
 from colmap_av1.tracks.tracks import build_tracks
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import (

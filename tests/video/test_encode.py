@@ -22,13 +22,7 @@ import pytest
 from conftest import HANDLE_INTERRUPTS, Encode, Ffmpeg, make_frames
 
 from colmap_av1.cli import main
-from colmap_av1.errors import (
-    BitstreamError,
-    ColmapAv1Error,
-    EncodeError,
-    OptionError,
-    VideoError,
-)
+from colmap_av1.errors import BitstreamError, ColmapAv1Error, EncodeError, OptionError, VideoError
 from colmap_av1.match import match
 from colmap_av1.motion.info import read_info
 from colmap_av1.motion.reading import read_motion

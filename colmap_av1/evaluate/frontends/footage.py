@@ -11,12 +11,7 @@ from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.choosing import existing_images
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_prepared
 from colmap_av1.matching.matched_images import pair_images, verify_images
-from colmap_av1.options import (
-    CameraOptions,
-    DensityOptions,
-    MatchOptions,
-    PairOptions,
-)
+from colmap_av1.options import CameraOptions, DensityOptions, MatchOptions, PairOptions
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import least_length
 from colmap_av1.tracks.video_tracks import open_source
@@ -30,7 +25,7 @@ from colmap_av1.video.unchanged import unchanged
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChosenImages:
+class FootageImages:
     """The frames of a video that become images.
 
     Attributes:
@@ -53,7 +48,7 @@ class ChosenImages:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Footage(ChosenImages):
+class Footage(FootageImages):
     """The input of every front-end.
 
     Attributes:
@@ -136,7 +131,7 @@ def choose_footage(
     """
     images = image_path if image_path is not None else folder / "images"
 
-    def make() -> ChosenImages:
+    def make() -> FootageImages:
         context = RunContext.of(options.run, progress)
         with unchanged(video.state) as check_video:
             prepared = prepare_images(
@@ -150,7 +145,7 @@ def choose_footage(
             chosen = prepared.tracked.chosen
             check_video()
             write_prepared(prepared, images, options.reading, progress)
-        return ChosenImages(
+        return FootageImages(
             names=chosen.names,
             frames=tuple(chosen.frames.tolist()),
             num_frames=prepared.tracked.tracks.num_frames,
@@ -183,7 +178,7 @@ def choose_footage(
         digest_if_there(options.images.frame_list),
         [file_digest(images / name) for name in existing],
     ]
-    chosen = run_stage_in(folder, depends_on, ChosenImages, make, products=[images]).result
+    chosen = run_stage_in(folder, depends_on, FootageImages, make, products=[images]).result
     return Footage(**vars(chosen), video=video.path, image_path=images, camera=options.camera)
 
 

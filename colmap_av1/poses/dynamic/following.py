@@ -14,10 +14,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.geometry.coverage import PosedCamera, views_of
 from colmap_av1.geometry.masks import Mask
-from colmap_av1.geometry.track_points import (
-    TriangulatedTracks,
-    triangulate_tracks,
-)
+from colmap_av1.geometry.track_points import TriangulatedTracks, triangulate_tracks
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import RefineOptions
 from colmap_av1.poses.posed_images import FOR_POSES, PosedImages
@@ -67,6 +64,8 @@ def follow_behind(
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.shown)):
         own = np.flatnonzero(registered.sequence == video)
+        if len(own) == 0:
+            continue
         frames = registered.frames[own]
         images = [registered.images[i] for i in own]
         views = views_of(images, registered.cameras, [masks[i] for i in own])

@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.geometry.coverage import views_of
 from colmap_av1.geometry.masks import Mask
-from colmap_av1.geometry.track_points import (
-    chaining_for_points,
-    triangulate_tracks,
-)
+from colmap_av1.geometry.track_points import chaining_for_points, triangulate_tracks
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.masks import mask_tracks
 from colmap_av1.images.track_images import MIN_IMAGES

@@ -16,12 +16,7 @@ from colmap_av1.geometry.alignment import PathFit, Up, east_north_up, fit_path
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.options.place import PlaceOptions, parse_distance
 from colmap_av1.poses.placing.distance import model_distance
-from colmap_av1.poses.placing.up import (
-    rotation_to_up,
-    up_of_cameras,
-    up_of_gravity,
-    up_of_lines,
-)
+from colmap_av1.poses.placing.up import rotation_to_up, up_of_cameras, up_of_gravity, up_of_lines
 from colmap_av1.util.arrays import Floats
 
 # Returns the planes of lines that may be vertical, given an approximate up direction, see
