@@ -312,7 +312,7 @@ def _run(command: Sequence[str], video: VideoFile, report: Callable[[int], None]
         reason = reason_in_log(log)
         if "No space left" in log or "File too large" in log:
             raise EncodeError(
-                f"{video}: no space for the stream: free some space, or write it elsewhere"
+                f"{video}: no disk space for the stream: free some space, or write it elsewhere"
             )
         if count == 0 and ("Invalid data" in log or "does not contain any stream" in log):
             raise VideoError(f"{video}: cannot be decoded: {reason}: give another copy")
