@@ -284,9 +284,7 @@ def match(
         known = joint.poses if joint is not None and not is_assumed else ()
         start = prepare_start(found.matched, found.cameras, clock, known)
         # The estimate does not change the cameras of an existing database.
-        undetermined_in = None
-        if cameras is None and joint is not None and is_assumed:
-            undetermined_in = joint.estimate.num_registered[0]
+        is_undetermined = cameras is None and joint is not None and is_assumed
         is_known_ahead = start.limits == FORWARD_MOTION and not is_assumed
         names = images.image_set.images.names
         started = _start_mapper(
@@ -295,7 +293,7 @@ def match(
             found,
             clock,
             fixed_intrinsics=is_known_ahead,
-            undetermined_in=undetermined_in,
+            is_undetermined=is_undetermined,
         )
         written = started.matched
         num_written, blurred = 0, list[str]()
@@ -555,7 +553,7 @@ def _start_mapper(
     clock: Clock,
     *,
     fixed_intrinsics: bool,
-    undetermined_in: int | None,
+    is_undetermined: bool,
 ) -> _MapperStart:
     """Choose pairs, cameras and fixed intrinsics so that the mapper starts a large model.
 
@@ -568,19 +566,16 @@ def _start_mapper(
         found: the matches and cameras.
         clock: gets the stage "verification".
         fixed_intrinsics: whether the mapper keeps the intrinsics.
-        undetermined_in: number of images of the largest model of the joint estimate, if that does
-            not determine the intrinsics; else None.
+        is_undetermined: whether the joint estimate does not determine the intrinsics.
     """
     cameras, known = found.cameras, with_known_focal_lengths(found.cameras)
     # Without depth, there is no good start.
     is_tried = start.is_tried or not found.depth.is_observable
     matched = warning = None
-    if undetermined_in is not None:
+    if is_undetermined:
         if not is_tried:
             with suppress(ModelError):
-                matched = demote_failing_starts(
-                    start, names, cameras, clock, num_assumed=undetermined_in
-                )
+                matched = demote_failing_starts(start, names, cameras, clock, is_assumed=True)
             if matched is not None:
                 return _MapperStart(matched, cameras, fixed_intrinsics=False)
             warning = (

@@ -18,7 +18,7 @@ import pycolmap
 from colmap_av1.database.writing import write_matches
 from colmap_av1.matching.initial_pairs import PreparedStart, are_far, with_demoted
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS
-from colmap_av1.matching.matched_images import MatchedImages
+from colmap_av1.matching.matched_images import MatchedImages, connected_images
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.mapper import start_mapper
 from colmap_av1.util.arrays import Bools
@@ -28,7 +28,7 @@ from colmap_av1.util.progress import Clock
 # number that COLMAP's mapper requires of a model, except of the first (min_model_size).
 _NUM_IMAGES = 10
 # If the focal length is a default, it has succeeded with this number of images, or with this share
-# of the largest model if that is less.
+# of the largest set of images that matches connect, if that is less.
 _NUM_ASSUMED, _ASSUMED_SHARE = 30, 0.9
 # Fewest images of a model that can be judged.
 _LEAST_IMAGES = 3
@@ -43,7 +43,7 @@ def demote_failing_starts(
     clock: Clock,
     *,
     fixed_intrinsics: bool = False,
-    num_assumed: int | None = None,
+    is_assumed: bool = False,
 ) -> MatchedImages | None:
     """Limit the inliers of pairs with which COLMAP's incremental mapper starts a small model.
 
@@ -57,8 +57,8 @@ def demote_failing_starts(
         cameras: the camera of each image. COLMAP 4.2 may crash if a focal length is not known.
         clock: gets the stage "verification".
         fixed_intrinsics: whether the mapper keeps the intrinsics.
-        num_assumed: number of images of the largest model if the focal length is a default, which
-            may diverge late: a start then needs more images. None: it is not a default.
+        is_assumed: whether the focal length is a default, which may diverge late: a start then
+            needs more images.
 
     Returns:
         The images with fewer inliers; None if no trial succeeds.
@@ -66,8 +66,9 @@ def demote_failing_starts(
     Raises:
         ModelError: the mapper stopped.
     """
-    if num_assumed is not None:
-        enough = min(_NUM_ASSUMED, round(_ASSUMED_SHARE * num_assumed))
+    if is_assumed:
+        most_connected = np.bincount(connected_images(start.matched)).max()
+        enough = min(_NUM_ASSUMED, round(_ASSUMED_SHARE * int(most_connected)))
     else:
         enough = min(_NUM_IMAGES, np.unique(start.matched.pairs).size // 2)
     num_images = max(_LEAST_IMAGES, enough)
