@@ -22,7 +22,6 @@ from colmap_av1.poses.adjusting import (
 )
 from colmap_av1.poses.corners.in_images import corners_in_images
 from colmap_av1.poses.dynamic.following import follow_behind, has_changing_masks
-from colmap_av1.poses.false_links import leaping_seams
 from colmap_av1.poses.posed_images import (
     FOR_POSES,
     FROM_PICTURES,
@@ -70,7 +69,6 @@ class AdjustedResult(PosesResult):
             and links follow.
         doubtful_seams: names of the images before and after each of `Seams.doubtful`.
         few_point_seams: names of the images before and after each of `Seams.few_points`.
-        leaping_seams: see `false_links.leaping_seams`.
         scale_lost_seams: names of the images before and after each of `Seams.worst_scale_lost`.
         usual_scaled: see `Seams.usual_scaled`.
         seams_warning: see `Seams.disconnected_warning`.
@@ -81,7 +79,6 @@ class AdjustedResult(PosesResult):
     num_motion_points: int
     doubtful_seams: tuple[tuple[str, str], ...]
     few_point_seams: tuple[tuple[str, str], ...]
-    leaping_seams: tuple[tuple[str, str], ...]
     scale_lost_seams: tuple[tuple[str, str], ...]
     usual_scaled: float
     seams_warning: str | None
@@ -172,7 +169,6 @@ def adjustment_stage(
             num_motion_points=int(is_motion.sum()),
             doubtful_seams=tuple(seams.pairs[i] for i in seams.doubtful),
             few_point_seams=tuple(seams.pairs[i] for i in seams.few_points),
-            leaping_seams=tuple(leaping_seams(trimmed.model, image_set)),
             scale_lost_seams=tuple(seams.pairs[i] for i in seams.worst_scale_lost),
             usual_scaled=seams.usual_scaled,
             # No warning about a lost scale: the model is split there, see `parts`.

@@ -22,6 +22,7 @@ from colmap_av1.poses.dynamic.stage import (
     without_dynamic_links,
     without_dynamic_tracks,
 )
+from colmap_av1.poses.false_links import leaping_seams
 from colmap_av1.poses.long_range_stage import LongRangeResult, long_range_stage
 from colmap_av1.poses.mapping_stage import MappedResult, mapping_stage, with_model_first
 from colmap_av1.poses.match_stage import MatchesResult, match_stage, read_links
@@ -342,7 +343,7 @@ def split_at_seams(
             break
         adjusted = posed.adjustment.result
         seams, num_images = posed.seams_to_split, adjusted.num_registered
-        leaps = adjusted.leaping_seams if is_further else ()
+        leaps = leaping_seams(read_poses(run, posed.adjustment), image_set) if is_further else []
         may_bend |= bool(seams)
         parts = None
         if seams or leaps:
@@ -361,7 +362,7 @@ def split_at_seams(
         if parts is None or parts.result.num_registered == num_images:
             if not may_bend:
                 break
-            seams, leaps = [], ()
+            seams, leaps = [], []
             parts = certain_stage(run, image_set, posed.mapped, posed.adjustment, number=number)
             if parts.result.num_registered == num_images:
                 break
