@@ -13,12 +13,12 @@ from pathlib import Path
 import cattrs
 import numpy as np
 
-from colmap_av1.errors import ColmapAv1Error, ModelError, writing
+from colmap_av1.errors import ColmapAv1Error, ModelError, OptionError, writing
 from colmap_av1.geometry.cameras import focal_length_warning
 from colmap_av1.geometry.track_points import LEAST_AGREEING
 from colmap_av1.geometry.uncertainty import expected_error, uncertainty_warning
 from colmap_av1.images.image_set import ImageSet, ShownVideo
-from colmap_av1.images.inputs import paths_of, read_inputs
+from colmap_av1.images.inputs import Inputs, paths_of, read_inputs
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.positions import image_positions
 from colmap_av1.images.preparing import check_fit
@@ -40,6 +40,7 @@ from colmap_av1.splats.reconstruct_model import ModelResult
 from colmap_av1.splats.reconstruct_models import FurtherModel, further_models, written_model
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.cpus import one_blas_thread
+from colmap_av1.util.digests import file_digest
 from colmap_av1.util.files import REPORT, check_apart, check_outside, scratch_folder, whole_file
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
@@ -80,6 +81,7 @@ class ReconstructReport:
     Attributes:
         output: the folder with `images/` and `sparse/0/`, which trainers open.
         videos: the videos.
+        video_digests: SHA-256 of each video file, in hexadecimal.
         conversion: how the videos were converted, in words; None if all are AV1.
         database: COLMAP database of the key images.
         num_frames: number of shown frames of the videos.
@@ -122,6 +124,7 @@ class ReconstructReport:
 
     output: Path
     videos: tuple[Path, ...]
+    video_digests: tuple[str, ...]
     conversion: str | None
     database: Path
     num_frames: int
@@ -190,7 +193,7 @@ def reconstruct(
         output: the folder; new, empty, or from an earlier run.
         photos: folder of photos of the same scene. None: no photos.
         gaussians: file (.ply) for initial Gaussians of the points.
-        overwrite: replace an existing file of Gaussians.
+        overwrite: replace an existing file of Gaussians, and the model of other videos.
         options: options of all stages.
         progress: called with a stage's name, the amount of work done, and the total if known.
 
@@ -201,8 +204,8 @@ def reconstruct(
         ImageError: images cannot be chosen.
         ModelError: no poses are found.
         WriteError: the output cannot be written.
-        OptionError: an option does not fit the video, the folder has other contents, or the file
-            of Gaussians cannot be made.
+        OptionError: an option does not fit the video, the folder has other contents or the model of
+            other videos, or the file of Gaussians cannot be made.
 
     Examples:
         >>> from colmap_av1 import ImageOptions, MatchOptions, ReconstructOptions, reconstruct
@@ -231,6 +234,8 @@ def reconstruct(
             masks.check([own.picture_size], names, options.match.images)
     context = RunContext.of(options.match.run, progress)
     with open_stages(output, "reconstruct") as stages, ExitStack() as opened:
+        if not overwrite:
+            _check_no_model_of_others(output, inputs)
         sources = tuple(
             opened.enter_context(
                 open_source(
@@ -260,6 +265,27 @@ def reconstruct(
             report = replace(report, gaussians=Path(gaussians))
         _write_report(report)
     return report
+
+
+def _check_no_model_of_others(output: Path, inputs: Inputs) -> None:
+    """Raise `OptionError` if the output is a finished model of other videos.
+
+    The same videos may have another path, or other contents.
+    """
+    try:
+        earlier = read_report(output)
+    except ModelError:
+        return
+    names = [path.name for path in earlier.videos]
+    if any(
+        video.path.name in names or file_digest(video.path) in earlier.video_digests
+        for video in inputs.videos
+    ):
+        return
+    raise OptionError(
+        f"{output}: has the model of {', '.join(names)}: give another folder, or --overwrite to "
+        "replace it"
+    )
 
 
 def _as_converted(options: ReconstructOptions) -> MatchOptions:
@@ -295,6 +321,7 @@ def _run_stages(run: Run) -> ReconstructReport:
     return ReconstructReport(
         output=run.output,
         videos=tuple(source.pictures.path for source in run.sources),
+        video_digests=tuple(file_digest(video.path) for video in run.inputs.videos),
         conversion=run.inputs.conversion([source.conversion for source in run.sources]),
         database=run.output / "database.db",
         num_frames=sum(stage.result.num_frames for stage in tracked),

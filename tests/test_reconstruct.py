@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import pycolmap
 import pytest
@@ -551,6 +552,17 @@ def test_output_with_files_of_others_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="not empty"):
         reconstruct(SCENE, tmp_path, options=OPTIONS)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_model_of_another_video_is_replaced_only_on_request(copy: Path, tmp_path: Path) -> None:
+    before = products(copy)
+    other = tmp_path / "other.mp4"
+    cut = ["-i", str(SCENE), "-c", "copy", "-frames:v", "30", str(other)]
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *cut], check=True)
+    with pytest.raises(OptionError, match="overwrite"):
+        reconstruct(other, copy, options=OPTIONS)
+    assert products(copy) == before
+    assert reconstruct(other, copy, overwrite=True, options=OPTIONS).num_frames == 30
 
 
 def test_camera_that_only_rotates_is_an_error(encode: Encode, tmp_path: Path) -> None:

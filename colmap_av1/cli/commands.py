@@ -459,7 +459,10 @@ COMMANDS = {
                 "also write the page OUTPUT.html, next to the folder, to view the model (needs the "
                 "viewer extra)",
             ),
-            _flag("overwrite", "replace an existing file of --gaussians or --report"),
+            _flag(
+                "overwrite",
+                "replace an existing file of --gaussians or --report, or a model of other videos",
+            ),
             _REPORT_JSON,
         ),
         (ReconstructOptions,),

@@ -69,7 +69,7 @@ class LinkReport:
         return (
             f"nothing connects frames {', '.join(shown)}{more}: the camera jerks, or a picture is "
             "blurred, or there is a cut, and the pictures have nothing in common; the images on "
-            "either side become separate models",
+            "either side are in separate models, or not registered",
         )
 
     def _part_warnings(self) -> tuple[str, ...]:
