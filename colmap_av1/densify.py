@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -43,9 +42,9 @@ from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import open_source
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import (
-    REPORT,
     check_new_folder,
     output_of_model,
+    read_output_report,
     scratch_folder,
     whole_folder,
 )
@@ -354,9 +353,8 @@ def _check_distorted(model: Path) -> None:
 def _has_undistorted(output: Path) -> bool:
     """Whether a folder has the report of `reconstruct`, alone or in a batch, with undistortion."""
     try:
-        found = json.loads((output / REPORT).read_text())
-        return bool(found.get("report", found).get("undistorted"))
-    except (OSError, ValueError, AttributeError):
+        return bool(read_output_report(output).get("undistorted"))
+    except (OSError, ValueError):
         return False
 
 

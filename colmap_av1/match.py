@@ -57,7 +57,7 @@ from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.cpus import one_blas_thread
-from colmap_av1.util.files import check_outside, scratch_folder
+from colmap_av1.util.files import STAGES, check_outside, scratch_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.kept_pictures import KeptPictures
@@ -627,7 +627,7 @@ def _match_jointly(
     context: RunContext,
 ) -> JointMatches:
     """Match the images by the observations that agree with an estimate of all poses."""
-    stages = scratch / ".stages"
+    stages = scratch / STAGES
     stages.mkdir()
     # The images are already chosen, and their names need not suit trainers. Tracks are long enough
     # in all frames, of which only the images may be left.

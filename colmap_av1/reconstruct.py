@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 from collections.abc import Container, Sequence
 from contextlib import ExitStack
@@ -41,7 +40,15 @@ from colmap_av1.splats.reconstruct_models import FurtherModel, further_models, w
 from colmap_av1.tracks.video_tracks import open_source, with_stream_kept
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.digests import file_digest
-from colmap_av1.util.files import REPORT, check_apart, check_outside, scratch_folder, whole_file
+from colmap_av1.util.files import (
+    REPORT,
+    check_apart,
+    check_outside,
+    read_output_report,
+    scratch_folder,
+    whole_file,
+)
+from colmap_av1.util.plain import json_text
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import open_stages
@@ -460,7 +467,7 @@ def read_report(output: str | os.PathLike[str]) -> ReconstructReport:
     """
     path = Path(output) / REPORT
     try:
-        return cattrs.structure(json.loads(path.read_text()), ReconstructReport)
+        return cattrs.structure(read_output_report(Path(output)), ReconstructReport)
     except (OSError, ValueError, TypeError, KeyError, cattrs.BaseValidationError) as error:
         raise ModelError(
             f"{path}: missing, damaged or from another version: run reconstruct again"
@@ -468,7 +475,6 @@ def read_report(output: str | os.PathLike[str]) -> ReconstructReport:
 
 
 def _write_report(report: ReconstructReport) -> None:
-    text = json.dumps(dataclasses.asdict(report), indent=1, default=str)
     path = report.output / REPORT
     with writing(path), whole_file(path) as partial:
-        partial.write_text(text + "\n")
+        partial.write_text(json_text(dataclasses.asdict(report)))

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from colmap_av1.batch.rows import json_text
+from colmap_av1.batch.rows import json_bytes
 from colmap_av1.errors import OptionError, writing
 from colmap_av1.util.files import REPORT, only_run, remove_leftovers, whole_file
 from colmap_av1.util.remote import filesystem, is_url
@@ -167,12 +167,12 @@ def publish(output: Output, folder: Path, name: str, report: dict[str, object]) 
     new = {*sources, REPORT}
     there = output.files(name)
     ours = _files_of_ours(output, name, there, new)
-    output.write(f"{name}/{_UNFINISHED}", json_text(sorted(ours | new)))
+    output.write(f"{name}/{_UNFINISHED}", json_bytes(sorted(ours | new)))
     for path in sorted((ours - new | {REPORT}) & there):
         output.remove(f"{name}/{path}")
     for path, source in sorted(sources.items()):
         output.take(source, f"{name}/{path}")
-    output.write(f"{name}/{REPORT}", json_text({**report, "files": sorted(new)}))
+    output.write(f"{name}/{REPORT}", json_bytes({**report, "files": sorted(new)}))
     output.remove(f"{name}/{_UNFINISHED}")
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import cattrs
 
-from colmap_av1.util.plain import plain
+from colmap_av1.util.plain import json_text
 from colmap_av1.util.remote import without_secrets
 
 
@@ -67,13 +66,12 @@ def csv_of(rows: Iterable[Row]) -> bytes:
 
 def json_of(rows: Iterable[Row], facts: Mapping[str, object]) -> bytes:
     """Facts of a batch and its rows as JSON."""
-    return json_text({**facts, "rows": [vars(row) for row in rows]})
+    return json_bytes({**facts, "rows": [vars(row) for row in rows]})
 
 
-def json_text(value: object) -> bytes:
+def json_bytes(value: object) -> bytes:
     """A value as the content of a JSON file, with secrets removed from URLs."""
-    text = json.dumps(plain(value, without_secrets), indent=1, allow_nan=False)
-    return f"{text}\n".encode("ascii")
+    return json_text(value, without_secrets).encode("ascii")
 
 
 def row_of(facts: object) -> Row:

@@ -21,8 +21,8 @@ from colmap_av1.batch.output import ROWS, Output, output_at, scratch_for
 from colmap_av1.batch.rows import Row, csv_of, json_of, row_of
 from colmap_av1.batch.video import SCRATCH, Outcome, Work, failed_row
 from colmap_av1.errors import OptionError, WriteError, cannot_write, writing
-from colmap_av1.options import BatchOptions, DensifyOptions, MatchOptions
-from colmap_av1.options.batch import TASK_OPTIONS
+from colmap_av1.options import BatchOptions, DensifyOptions
+from colmap_av1.options.batch import TASK_OPTIONS, match_options_of
 from colmap_av1.options.fields import Options
 from colmap_av1.util.digests import package_version
 from colmap_av1.util.files import remove_leftovers
@@ -341,8 +341,8 @@ def _work_of(task: Options, output: str, models: str | None, options: BatchOptio
     if (models is not None) != isinstance(task, DensifyOptions):
         what = "is for" if models is not None else "is missing for"
         raise OptionError(f"models {what} the task densify: give a folder of models with it only")
-    matching = task if isinstance(task, MatchOptions) else getattr(task, "match", None)
-    if isinstance(matching, MatchOptions) and matching.keep_stream is not None:
+    matching = match_options_of(task)
+    if matching is not None and matching.keep_stream is not None:
         raise OptionError("keep_stream is one file, but a batch has many videos: omit it")
     return Work(
         task=name,

@@ -17,12 +17,13 @@ from colmap_av1.batch.inputs import Video
 from colmap_av1.batch.output import earlier_report, output_at, publish, remove_list_of_unfinished
 from colmap_av1.batch.rows import Row, row_of
 from colmap_av1.errors import ModelError, OptionError, VideoError
-from colmap_av1.options import BatchOptions, MatchOptions
+from colmap_av1.options import BatchOptions
+from colmap_av1.options.batch import match_options_of
 from colmap_av1.options.fields import Options
 from colmap_av1.options.words import words_of
 from colmap_av1.util.digests import digest_of, digest_of_tree
 from colmap_av1.util.failures import Failure, failure_of
-from colmap_av1.util.files import scratch_folder
+from colmap_av1.util.files import STAGES, scratch_folder
 from colmap_av1.util.processes import bound
 from colmap_av1.util.remote import fetch, is_url, version_of, without_secrets
 
@@ -32,8 +33,6 @@ SCRATCH = "video"
 _THUMBNAIL_WIDTH = 160
 _THUMBNAIL_TIME = 60.0  # seconds
 _IMAGES = "images"
-# Intermediate results, which only another run of the same command would use.
-_STAGES = ".stages"
 # Where a model may lie in the folder given for a video.
 _MODEL_FOLDERS = ("", "sparse/0", "0")
 _MODEL_FILES = ("cameras", "images", "points3D")
@@ -144,7 +143,9 @@ def _attempt(work: Work, video: Video, threads: int, processes: Processes) -> Ou
         words = _words(work, path, model, folder, threads)
         facts, warnings = run_command(words, scratch, names, work.batch.timeout, processes)
         _write_thumbnail(path, folder)
-        shutil.rmtree(folder / _STAGES, ignore_errors=True)
+        # Only another run of the same command would use intermediate results.
+        for stages in [*folder.rglob(STAGES)]:
+            shutil.rmtree(stages)
         report = facts["report"]
         figures = {column: report.get(field) for column, field in _FIGURES.items()}
         if work.task == "info":
@@ -190,12 +191,9 @@ def _words(work: Work, video: Path, model: Path | None, folder: Path, threads: i
 
 def _depends_on(work: Work) -> list[object]:
     """What the result depends on, in addition to the video and the version."""
-    options = work.options
-    matching = options if isinstance(options, MatchOptions) else getattr(options, "match", None)
-    if not isinstance(matching, MatchOptions):
-        return [work.task, options, None, work.batch.write_images]
-    files = [digest_of_tree(path) for path in matching.files]
-    return [work.task, options, files, work.batch.write_images]
+    matching = match_options_of(work.options)
+    files = [digest_of_tree(path) for path in matching.files] if matching is not None else None
+    return [work.task, work.options, files, work.batch.write_images]
 
 
 def _model_versions(work: Work, video: Video) -> list[tuple[str, dict[str, object]]]:

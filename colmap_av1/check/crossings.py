@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from colmap_av1.database.file import open_unaltered
-from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_row, matches_from_row
+from colmap_av1.database.reading import image_ids_from_pair_id, matches_from_row, read_keypoints
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.colmap_model import ModelImage, posed_images
 from colmap_av1.matching.mapper_limits import MIN_INLIERS
@@ -126,13 +126,9 @@ def _fitting(
                 "mapped from"
             )
         rays: dict[int, Floats] = {}
-        for image_id, *row in connection.execute(
-            "SELECT image_id, rows, cols, data FROM keypoints WHERE rows > 0"
-        ):
-            if image_id in of_id:
-                xy = keypoints_from_row(database, image_id, *row)[:, :2].astype(np.float64)
-                camera = cameras[images[of_id[image_id]].camera_id]
-                rays[image_id] = np.asarray(camera.cam_from_img(xy)).T
+        for image_id, image in of_id.items():
+            xy = read_keypoints(connection, database, image_id)[:, :2].astype(np.float64)
+            rays[image_id] = np.asarray(cameras[images[image].camera_id].cam_from_img(xy)).T
         for pair_id, *row in connection.execute(
             "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows >= ?",
             (MIN_INLIERS,),

@@ -40,7 +40,7 @@ def batch_progress(quiet: bool) -> Iterator[tuple[Callable[[str], None], OnProgr
         bar = progress.add_task("videos", total=None, rate="", failed="")
 
         def show(text: str) -> None:
-            progress.console.print(Text(on_one_line(f"{PROGRAM}: {text}")))
+            progress.console.print(Text(on_one_line(f"{PROGRAM}: warning: {text}")))
 
         failures = _Failures(show)
 
@@ -70,9 +70,9 @@ class _Failures:
             return
         self._num_shown += 1
         if self._num_shown > _MOST_LINES:
-            self._show("warning: further failures are in batch.csv")
+            self._show("further failures are in batch.csv")
             return
-        self._show(f"warning: {row.name}: {row.reason}: {row.error}")
+        self._show(f"{row.name}: {row.reason}: {row.error}")
 
 
 class _Lines:
@@ -80,7 +80,7 @@ class _Lines:
 
     def __init__(self, quiet: bool) -> None:
         self._quiet = quiet
-        self._failures = _Failures(lambda text: print_warning(text.removeprefix("warning: ")))
+        self._failures = _Failures(print_warning)
         self._start = self._last = time.monotonic()
 
     def on_start(self, about: str) -> None:

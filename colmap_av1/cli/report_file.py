@@ -15,7 +15,7 @@ from colmap_av1.cli.terminal import renamed
 from colmap_av1.errors import OptionError, WriteError, writing
 from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.files import check_creatable, whole_file
-from colmap_av1.util.plain import plain
+from colmap_av1.util.plain import json_text
 
 # Options that name the outputs of commands.
 _OUTPUTS = ("database", "output", "gaussians", "keep_stream")
@@ -88,4 +88,4 @@ def _write(path: str, facts: dict[str, Any]) -> None:
     with writing(Path(path)):
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         with whole_file(Path(path)) as partial:
-            partial.write_text(json.dumps(plain(facts, renamed), indent=1, allow_nan=False) + "\n")
+            partial.write_text(json_text(facts, renamed))

@@ -192,15 +192,20 @@ def cameras_of(connection: sqlite3.Connection, path: Path) -> dict[int, pycolmap
     return cameras
 
 
-def keypoints_from_row(
-    path: Path, image_id: int, num_rows: int, num_cols: int, data: bytes | None
+def read_keypoints(
+    connection: sqlite3.Connection, path: Path, image_id: int
 ) -> NDArray[np.float32]:
-    """Decode a row of keypoints: float32 [n, 2], [n, 4] or [n, 6], x and y first.
+    """Read the keypoints of an image: float32 [n, 2], [n, 4] or [n, 6], x and y first.
 
     Raises:
         DatabaseError: the row's size contradicts its counts, or a position is not finite.
     """
-    keypoints = stored_keypoints(path, image_id, num_rows, num_cols, data)
+    row = connection.execute(
+        "SELECT rows, cols, data FROM keypoints WHERE image_id = ? AND rows > 0", (image_id,)
+    ).fetchone()
+    if row is None:
+        return np.empty((0, 2), np.float32)
+    keypoints = stored_keypoints(path, image_id, *row)
     if not np.isfinite(keypoints[:, :2]).all():
         raise DatabaseError(
             f"{path}: image {image_id} has keypoints that are not finite numbers: "
@@ -212,7 +217,11 @@ def keypoints_from_row(
 def stored_keypoints(
     path: Path, image_id: int, num_rows: int, num_cols: int, data: bytes | None
 ) -> NDArray[np.float32]:
-    """Like `keypoints_from_row`, without checking that positions are finite."""
+    """Decode a row of keypoints, without checking that positions are finite.
+
+    Raises:
+        DatabaseError: the row's size contradicts its counts.
+    """
     if num_cols not in SHAPES or len(data or b"") != 4 * num_rows * num_cols:
         raise DatabaseError(
             f"{path}: the keypoints of image {image_id} are damaged ({num_rows} rows of "

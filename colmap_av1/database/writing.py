@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +18,9 @@ from colmap_av1.database.reading import (
     SHAPES,
     WGS84,
     image_ids_from_pair_id,
-    keypoints_from_row,
     matches_from_row,
     pair_id_from_image_ids,
+    read_keypoints,
 )
 from colmap_av1.errors import DatabaseError
 from colmap_av1.matching.matched_images import MatchedImages
@@ -43,7 +43,7 @@ _UNKNOWN = np.full(9, np.nan, dtype="<f8")
 def write_matches(
     database: str | os.PathLike[str],
     names: Sequence[str],
-    cameras: pycolmap.Camera | Sequence[pycolmap.Camera] | None,
+    cameras: Sequence[pycolmap.Camera] | None,
     matched: MatchedImages,
     on_existing: OnExisting = "error",
     *,
@@ -73,8 +73,8 @@ def write_matches(
     Args:
         database: path of the file.
         names: name of each image, its path relative to the image folder.
-        cameras: the camera of all inserted images, or one for each image, where images may share
-            the same object; may be None if the database lists the images.
+        cameras: the camera of each image, where images may share the same object; may be None if
+            the database lists the images.
         matched: the keypoints of the images, and the matches and geometries of their pairs.
         on_existing: what happens to existing keypoints and matches of the images.
         places: float64 [num_images, 3] latitude and longitude in degrees and altitude in metres of
@@ -141,7 +141,8 @@ def check_writable(database: str | os.PathLike[str]) -> None:
         raise DatabaseError(f"{path}: no permission to write a database there: give another path")
 
     def fill(connection: sqlite3.Connection) -> None:
-        _ids_of_images(connection, path, (), None, "error")
+        if not has_rows(connection, "images"):
+            _check_no_lone_rigs(connection, path)
 
     if not new:
         write_existing(path, fill)
@@ -151,7 +152,7 @@ def _ids_of_images(
     connection: sqlite3.Connection,
     path: Path,
     names: Sequence[str],
-    cameras: pycolmap.Camera | Sequence[pycolmap.Camera] | None,
+    cameras: Sequence[pycolmap.Camera] | None,
     on_existing: OnExisting,
 ) -> list[int]:
     """Ids of the named images; images that the database does not list are inserted."""
@@ -163,32 +164,29 @@ def _ids_of_images(
             "that it lists, or a new database"
         )
     if not listed:
-        for table in ("rigs", "frames"):
-            if columns(connection, table) and has_rows(connection, table):
-                raise DatabaseError(
-                    f"{path} has {table} but no images: import its images first, or use a new "
-                    "database"
-                )
+        _check_no_lone_rigs(connection, path)
     if absent:
         if cameras is None:
-            raise ValueError("give a camera: the database lists no images")
-        if not isinstance(cameras, pycolmap.Camera):
-            if len(cameras) != len(names):
-                raise ValueError("give one camera, or one for each image")
-            each = dict(zip(names, cameras, strict=True))
-            cameras = [each[name] for name in absent]
-        listed |= _insert_images(connection, absent, cameras)
+            raise ValueError("give cameras: the database lists no images")
+        camera_of = dict(zip(names, cameras, strict=True))
+        listed |= _insert_images(connection, {name: camera_of[name] for name in absent})
     return [listed[name] for name in names]
 
 
+def _check_no_lone_rigs(connection: sqlite3.Connection, path: Path) -> None:
+    """Refuse a database that has rigs or frames, but no images."""
+    for table in ("rigs", "frames"):
+        if columns(connection, table) and has_rows(connection, table):
+            raise DatabaseError(
+                f"{path} has {table} but no images: import its images first, or use a new database"
+            )
+
+
 def _insert_images(
-    connection: sqlite3.Connection,
-    names: Sequence[str],
-    cameras: pycolmap.Camera | Sequence[pycolmap.Camera],
+    connection: sqlite3.Connection, camera_of: Mapping[str, pycolmap.Camera]
 ) -> dict[str, int]:
-    """Insert images with one shared camera or one each; returns the image id of each name."""
-    each = [cameras] * len(names) if isinstance(cameras, pycolmap.Camera) else list(cameras)
-    rows = list({id(camera): camera for camera in each}.values())
+    """Insert images by name, each with its camera; returns the image id of each name."""
+    rows = list({id(camera): camera for camera in camera_of.values()}.values())
     row_of = {id(camera): row for row, camera in enumerate(rows)}
     (first_id,) = connection.execute(
         "SELECT COALESCE(MAX(camera_id), 0) + 1 FROM cameras"
@@ -215,10 +213,10 @@ def _insert_images(
         "INSERT INTO images (image_id, name, camera_id) VALUES (?, ?, ?)",
         (
             (first_image_id + i, name, first_id + row_of[id(camera)])
-            for i, (name, camera) in enumerate(zip(names, each, strict=True))
+            for i, (name, camera) in enumerate(camera_of.items())
         ),
     )
-    return {name: first_image_id + i for i, name in enumerate(names)}
+    return {name: first_image_id + i for i, name in enumerate(camera_of)}
 
 
 def _check_nothing_lost(
@@ -268,7 +266,7 @@ def _append_keypoints(
     all_present = any(len(k.xy) for k in keypoints)
     for index in np.argsort(np.asarray(image_ids, dtype=np.int64)):
         image_id, xy = image_ids[index], keypoints[index].xy.astype("<f4")
-        present = _read_present_keypoints(connection, path, image_id)
+        present = read_keypoints(connection, path, image_id)
         firsts[index] = len(present)
         all_present &= np.array_equal(present[len(present) - len(xy) :, :2], xy)
         shapes = np.tile(np.array(SHAPES[present.shape[1]], dtype="<f4"), (len(xy), 1))
@@ -284,18 +282,6 @@ def _append_keypoints(
             "append, or use on_existing replace to write them again"
         )
     return firsts
-
-
-def _read_present_keypoints(
-    connection: sqlite3.Connection, path: Path, image_id: int
-) -> NDArray[np.float32]:
-    """An image's existing keypoints with all columns; float32 [0, 2] if it has none."""
-    row = connection.execute(
-        "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)
-    ).fetchone()
-    if row is None or row[0] == 0:
-        return np.empty((0, 2), dtype="<f4")
-    return keypoints_from_row(path, image_id, *row)
 
 
 def _append_descriptors(

@@ -20,7 +20,7 @@ from colmap_av1.geometry.binary_files import CAMERA_HEAD, ELEMENT, OBSERVATION, 
 from colmap_av1.geometry.cameras import camera_fault
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.util.arrays import Floats
-from colmap_av1.util.files import may_read
+from colmap_av1.util.files import STAGES, may_read
 from colmap_av1.util.grouping import grouped
 from colmap_av1.util.texts import check_name
 
@@ -209,7 +209,7 @@ def read_model(model: str | os.PathLike[str]) -> pycolmap.Reconstruction:
         all((path / f"{name}{suffix}").is_file() for name in _FILES) for suffix in (".bin", ".txt")
     ):
         found = sorted(path.glob("**/cameras.bin"))
-        inside = next((p for p in found if ".stages" not in p.parts), None)
+        inside = next((p for p in found if STAGES not in p.parts), None)
         hint = f": did you mean {inside.parent}?" if inside else ": give a mapper's output folder"
         raise ModelError(f"{path}: has no COLMAP model (cameras, images, points3D){hint}")
     for file in (path / f"{name}{suffix}" for name in _FILES for suffix in (".bin", ".txt")):

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1.database.file import is_new, open_unaltered
-from colmap_av1.database.reading import image_ids_from_pair_id, keypoints_from_row, matches_from_row
+from colmap_av1.database.reading import image_ids_from_pair_id, matches_from_row, read_keypoints
 from colmap_av1.errors import DatabaseError, HlocError, writing
 from colmap_av1.options import ExportOptions
 from colmap_av1.util.arrays import Ints
@@ -177,12 +177,7 @@ def _write_features(
     ).fetchall()
     counts = {}
     for done, (image_id, name, width, height) in enumerate(rows, 1):
-        row = connection.execute(
-            "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)
-        ).fetchone()
-        xy = np.empty((0, 2), dtype=np.float32)
-        if row is not None and row[0]:
-            xy = keypoints_from_row(path, image_id, *row)[:, :2]
+        xy = read_keypoints(connection, path, image_id)[:, :2]
         counts[image_id] = len(xy)
         write(f"{name}/keypoints", _to_hloc(xy)).attrs["uncertainty"] = 1.0
         write(f"{name}/image_size", np.array([width, height], dtype=np.int64))

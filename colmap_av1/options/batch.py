@@ -102,3 +102,9 @@ TASK_OPTIONS: dict[str, type[Options]] = {
     "densify": DensifyOptions,
     "info": ReadOptions,
 }
+
+
+def match_options_of(task: Options) -> MatchOptions | None:
+    """The options for matching in those of a task; None if it has none."""
+    options = task if isinstance(task, MatchOptions) else getattr(task, "match", None)
+    return options if isinstance(options, MatchOptions) else None

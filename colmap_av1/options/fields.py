@@ -179,11 +179,11 @@ def _plain(value: Any, hint: Any) -> Any:
 
     Digests and command lines are made from plain numbers only.
     """
-    if type(value) in (int, float):
-        return value
-    for member in members_of(hint):
-        if member in (int, float) and _is_of(value, member):
-            return member(value)
+    members = members_of(hint)
+    for kind in (int, float):
+        if kind in members and _is_of(value, kind):
+            return kind(value) if abs(value) <= _LARGEST else value  # a float may overflow
+    for member in members:
         if typing.get_origin(member) is tuple and isinstance(value, tuple):
             return tuple(_plain(v, typing.get_args(member)[0]) for v in value)
     return value

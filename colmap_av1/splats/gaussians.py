@@ -121,9 +121,10 @@ def _on_surfaces(xyz: Floats) -> tuple[Floats, Floats]:
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
     rotation, normal = np.empty((len(xyz), 4)), np.empty((len(xyz), 3))
-    tree = KDTree(xyz) if len(xyz) else None
+    if len(xyz) == 0:
+        return rotation, normal
+    tree = KDTree(xyz)
     for first in range(0, len(xyz), _CHUNK):
-        assert tree is not None
         own = slice(first, first + _CHUNK)
         _, around = tree.query(xyz[own], k=np.arange(min(_AROUND + 1, len(xyz))) + 1)
         offset = xyz[around] - xyz[around].mean(axis=1, keepdims=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sqlite3
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ _PERMANENT = (
     NotADirectoryError,
     PermissionError,
 )
+_PERMANENT_NUMBERS = (errno.EFBIG, errno.EINVAL, errno.ENAMETOOLONG)
 # Failures that the video or the options cause. The first matching class is used.
 _REASONS: tuple[tuple[type[Exception], str], ...] = (
     (NotAv1Error, "not AV1"),
@@ -70,7 +72,9 @@ def failure_of(error: BaseException) -> Failure:
 def _is_transient(error: BaseException) -> bool:
     if isinstance(error, sqlite3.OperationalError):
         return "full" in str(error) or "I/O" in str(error)
-    return isinstance(error, OSError) and not isinstance(error, _PERMANENT)
+    if not isinstance(error, OSError) or isinstance(error, _PERMANENT):
+        return False
+    return error.errno not in _PERMANENT_NUMBERS
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import glob
+import json
 import os
 import re
 import secrets
@@ -18,6 +19,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePath
+from typing import Any
 
 from colmap_av1.errors import OptionError, cannot_write
 from colmap_av1.util.signals import held_back
@@ -31,6 +33,8 @@ _Path = str | os.PathLike[str]
 
 # Report of a run in its output folder. In a batch, it marks the folder of a video as complete.
 REPORT = "report.json"
+# Folder of intermediate results, in the output of a run and of each of its further models.
+STAGES = ".stages"
 # Locks of some cluster file systems are visible on one machine only, so each machine removes only
 # its own leftovers.
 _OURS = f"colmap-av1-{zlib.crc32(socket.gethostname().encode()) & 0xFFFF:04x}"
@@ -52,6 +56,20 @@ def output_of_model(model: Path) -> Path | None:
     own = folder.parents[1]
     outputs = [own, own.parent] if own.name.startswith("model_") else [own]
     return next((output for output in outputs if (output / REPORT).is_file()), None)
+
+
+def read_output_report(output: Path) -> dict[str, Any]:
+    """The report of `reconstruct` in its output, alone or in a batch.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is damaged.
+    """
+    found = json.loads((output / REPORT).read_text())
+    report = found.get("report", found) if isinstance(found, dict) else None
+    if not isinstance(report, dict):
+        raise ValueError("no report")
+    return report
 
 
 def check_new_file(

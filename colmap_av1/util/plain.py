@@ -1,9 +1,15 @@
-"""Convert values to those that JSON can hold."""
+"""Convert values to JSON."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping
+
+
+def json_text(value: object, spell: Callable[[str], str] = str) -> str:
+    """A value as the text of a JSON file; see `plain`."""
+    return json.dumps(plain(value, spell), indent=1, allow_nan=False) + "\n"
 
 
 def plain(value: object, spell: Callable[[str], str] = str) -> object:

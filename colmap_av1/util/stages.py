@@ -32,10 +32,9 @@ from colmap_av1.util.digests import (
     library_versions,
     package_version,
 )
-from colmap_av1.util.files import only_run, remove_leftovers, whole_file
+from colmap_av1.util.files import STAGES, only_run, remove_leftovers, whole_file
 from colmap_av1.util.memory import give_back_free_memory
 
-_FOLDER = ".stages"
 WHOLE_PACKAGE = (".",)
 
 _Result = TypeVar("_Result")
@@ -82,7 +81,7 @@ def open_stages(output: Path, command: str) -> Iterator[Path]:
         OptionError: the output folder contains something else, or another run is writing to it.
         WriteError: it cannot be created.
     """
-    stages = output / _FOLDER
+    stages = output / STAGES
     with ExitStack() as running:
         with writing(output):
             if output.exists() and not output.is_dir():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import errno
 import os
 import unicodedata
 from collections.abc import Sequence
@@ -57,10 +58,11 @@ def read_lines(path: str | os.PathLike[str]) -> list[str]:
     """
     path = Path(path)
     if path.exists() and not path.is_file():
-        what = "is a folder" if path.is_dir() else "is not a regular file: copy it to one first"
-        raise OSError(None, what)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "is a folder")
+        raise OSError(errno.EINVAL, "is not a regular file: copy it to one first")
     if path.stat().st_size > _LARGEST:
-        raise OSError(None, "is too large")
+        raise OSError(errno.EFBIG, "is too large")
     content = path.read_bytes()
     return content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig").splitlines()
 

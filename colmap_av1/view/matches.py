@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from colmap_av1.database.file import open_unaltered
 from colmap_av1.database.reading import (
     image_ids_from_pair_id,
-    keypoints_from_row,
     matches_from_row,
     pair_id_from_image_ids,
+    read_keypoints,
 )
 from colmap_av1.errors import DatabaseError, ImageError
 from colmap_av1.images.files import read_image
@@ -105,12 +105,7 @@ def _read_pair(
             raise DatabaseError(
                 f"{path}: has no matches of {names[0]!r} and {names[1]!r}: give another pair"
             )
-        keypoints = []
-        for image_id in ids:
-            row = connection.execute(
-                "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)
-            ).fetchone()
-            keypoints.append(keypoints_from_row(path, image_id, *(row or (0, 2, None)))[:, :2])
+        keypoints = [read_keypoints(connection, path, image_id)[:, :2] for image_id in ids]
     if ids[0] > ids[1]:
         matches = matches[:, ::-1]
     if np.any(matches.max(axis=0) >= [len(k) for k in keypoints]):
@@ -140,7 +135,7 @@ def _draw_matches(
     # Sorting by coarse rows makes every n-th match evenly spread over the image.
     order = np.lexsort((a[:, 0], a[:, 1] // 16))
     chosen = order[:: max(1, math.ceil(len(order) / _MAX_LINES))]
-    hue = np.linspace(0, 179, len(chosen)) if len(chosen) else np.empty(0)
+    hue = np.linspace(0, 179, len(chosen))
     full = np.full(len(chosen), 255.0)
     ends = np.stack([a[chosen], b[chosen] + shift], axis=1)
     for line, colour in zip(fixed_point(ends), bgr(hue, full, full), strict=True):

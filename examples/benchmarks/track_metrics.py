@@ -15,8 +15,8 @@ from colmap_av1 import DatabaseError, Tracks
 from colmap_av1.database.file import open_unaltered
 from colmap_av1.database.reading import (
     image_ids_from_pair_id,
-    keypoints_from_row,
     matches_from_row,
+    read_keypoints,
 )
 from colmap_av1.evaluate.metrics.poses import frame_number
 from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
@@ -91,12 +91,7 @@ def _read(
     with open_unaltered(database) as connection:
         images = dict(connection.execute("SELECT image_id, name FROM images ORDER BY image_id"))
         sizes = set(connection.execute("SELECT width, height FROM cameras").fetchall())
-        keypoints = {i: np.empty((0, 2), dtype=np.float32) for i in images}
-        for image_id, *row in connection.execute(
-            "SELECT image_id, rows, cols, data FROM keypoints WHERE rows > 0"
-        ):
-            if image_id in images:
-                keypoints[image_id] = keypoints_from_row(database, image_id, *row)[:, :2]
+        keypoints = {i: read_keypoints(connection, database, i)[:, :2] for i in images}
         first = dict(zip(images, np.cumsum([0, *map(len, keypoints.values())]), strict=False))
         edges = [np.empty((0, 2), dtype=np.int64)]
         for pair_id, *row in connection.execute(

@@ -13,6 +13,7 @@ import pycolmap
 import pytest
 from existing_database import (
     CAMERA,
+    CAMERAS,
     LAYOUTS,
     NAMES,
     NUM_IMAGES,
@@ -52,7 +53,7 @@ def maps(path: Path) -> bool:
 
 def test_report_of_a_new_database(tmp_path: Path) -> None:
     path = tmp_path / "new.db"
-    write_matches(path, NAMES, CAMERA, OURS)
+    write_matches(path, NAMES, CAMERAS, OURS)
     report = check_database(path)
     assert (report.layout, report.readers) == ("3.8 or 3.9", "3.8 and later")
     assert report.user_version == 3800
@@ -79,7 +80,7 @@ def test_versions_without_a_camera_model_are_not_named(tmp_path: Path) -> None:
     """COLMAP 3.8 aborts on camera models that it does not know."""
     path = tmp_path / "new.db"
     camera = pycolmap.Camera(model="DIVISION", width=WIDTH, height=HEIGHT, params=[300] * 4 + [0])
-    write_matches(path, NAMES, camera, OURS)
+    write_matches(path, NAMES, [camera] * len(NAMES), OURS)
     assert "DIVISION" in check_database(path).readers
 
 
@@ -295,7 +296,7 @@ def test_changed_database_gives_the_finding(
 )
 def test_little_parallax_is_reported(tmp_path: Path, arc: float, severity: str) -> None:
     scene = make_scene(num_frames=NUM_IMAGES, num_points=500, noise=0.05, arc_degrees=arc)
-    write_matches(tmp_path / "a.db", NAMES, CAMERA, match_scene(scene, CAMERA))
+    write_matches(tmp_path / "a.db", NAMES, CAMERAS, match_scene(scene, CAMERA))
     report = check_database(tmp_path / "a.db")
     assert any(kind == severity and "parallax" in text for kind, text in found(report))
     assert report.parallax is not None
@@ -305,7 +306,7 @@ def test_little_parallax_is_reported(tmp_path: Path, arc: float, severity: str) 
 def test_pairs_of_a_calibrated_rig_are_used(tmp_path: Path) -> None:
     """Their pose comes from the essential matrix, as for calibrated pairs."""
     path = tmp_path / "a.db"
-    write_matches(path, NAMES, CAMERA, OURS)
+    write_matches(path, NAMES, CAMERAS, OURS)
     before = check_database(path)
     alter(path, "UPDATE two_view_geometries SET config = 9")
     report = check_database(path)
@@ -318,7 +319,7 @@ def test_pairs_of_a_calibrated_rig_are_used(tmp_path: Path) -> None:
 def test_assumed_focal_length_is_reported(tmp_path: Path) -> None:
     guess = make_camera(CameraOptions(), WIDTH, HEIGHT)
     scene = make_scene(num_frames=NUM_IMAGES, num_points=500)
-    write_matches(tmp_path / "a.db", NAMES, guess, match_scene(scene, guess))
+    write_matches(tmp_path / "a.db", NAMES, [guess] * len(NAMES), match_scene(scene, guess))
     report = check_database(tmp_path / "a.db")
     assert report.configs.keys() == {"UNCALIBRATED"}
     assert report.parallax is not None
@@ -346,7 +347,7 @@ def test_forward_motion_is_reported(tmp_path: Path) -> None:
         confirmed=np.zeros(num * NUM_IMAGES, dtype=np.bool_),
     )
     drive = dataclasses.replace(scene, tracks=tracks)
-    write_matches(tmp_path / "a.db", NAMES, CAMERA, match_scene(drive, CAMERA))
+    write_matches(tmp_path / "a.db", NAMES, CAMERAS, match_scene(drive, CAMERA))
     texts = [text for _, text in found(check_database(tmp_path / "a.db"))]
     assert any("axis" in text for text in texts)
 
@@ -449,7 +450,7 @@ def test_check_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
 def test_large_image_ids_are_read(tmp_path: Path) -> None:
     """The ids are near the limit of COLMAP's pair ids."""
     path = tmp_path / "a.db"
-    write_matches(path, NAMES[:2], CAMERA, two_images())
+    write_matches(path, NAMES[:2], CAMERAS[:2], two_images())
     big = 2147483646
     for table in ("images", "keypoints"):
         alter(path, f"UPDATE {table} SET image_id = ? WHERE image_id = 2", big)

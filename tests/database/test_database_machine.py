@@ -35,6 +35,7 @@ from colmap_av1.view import view_database
 
 EXAMPLES = os.environ.get("COLMAP_AV1_EXAMPLES")
 NAMES = ["f0.png", "f1.png", "f2.png"]
+CAMERAS = [CAMERA] * len(NAMES)
 NUM_KEYPOINTS = 20
 # Largest CPU time of a step, in seconds.
 LIMIT = 2.0
@@ -143,14 +144,14 @@ class Databases(RuleBasedStateMachine):
         make_layout(self.path, layout)
         query(self.path, "PRAGMA journal_mode = DELETE")
         if fills:
-            write_matches(self.path, NAMES, CAMERA, new_rows(0))
+            write_matches(self.path, NAMES, CAMERAS, new_rows(0))
 
     @rule(mode=st.sampled_from(["error", "append", "replace"]))
     def write(self, mode: Any) -> None:
         self.seed += 1
         rows = new_rows(self.seed)
         self.attempt(
-            lambda: write_matches(self.path, NAMES, CAMERA, rows, on_existing=mode), writes=True
+            lambda: write_matches(self.path, NAMES, CAMERAS, rows, on_existing=mode), writes=True
         )
 
     @rule(where=st.sampled_from(COLUMNS), value=VALUES, which=st.integers(0, 2))

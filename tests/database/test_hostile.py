@@ -17,6 +17,7 @@ import pytest
 from conftest import PROJECT
 from existing_database import (
     CAMERA,
+    CAMERAS,
     LAYOUTS,
     NAMES,
     NUM_IMAGES,
@@ -214,8 +215,8 @@ def readers_and_writers(path: Path, folder: Path) -> list[tuple[str, Callable[[]
         ("check", lambda: check_database(path)),
         ("images", lambda: read_images(path)),
         ("cameras", lambda: read_cameras(path)),
-        ("write", lambda: write_matches(path, NAMES, CAMERA, OURS, on_existing="append")),
-        ("replace", lambda: write_matches(path, NAMES, CAMERA, OURS, on_existing="replace")),
+        ("write", lambda: write_matches(path, NAMES, CAMERAS, OURS, on_existing="append")),
+        ("replace", lambda: write_matches(path, NAMES, CAMERAS, OURS, on_existing="replace")),
         ("export", lambda: export_hloc(path, folder / "hloc")),
         ("view", lambda: view_database(path, folder)),
         ("copy", lambda: copy_database(path, folder / "copy.db")),
@@ -293,7 +294,7 @@ def test_functions_in_the_schema_are_not_called(tmp_path: Path, sound: bytes) ->
     )
     before = path.read_bytes()
     with pytest.raises(DatabaseError):
-        write_matches(path, NAMES, CAMERA, OURS, on_existing="append")
+        write_matches(path, NAMES, CAMERAS, OURS, on_existing="append")
     assert path.read_bytes() == before
 
 
@@ -395,7 +396,7 @@ def test_strict_check_reports_the_problem(  # noqa: PLR0917
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_layout_is_read_and_written(tmp_path: Path, layout: str) -> None:
     make_layout(tmp_path / "a.db", layout)
-    write_matches(tmp_path / "a.db", NAMES, CAMERA, OURS)
+    write_matches(tmp_path / "a.db", NAMES, CAMERAS, OURS)
     assert check_database(tmp_path / "a.db").mappable
 
 

@@ -45,6 +45,7 @@ from colmap_av1.options import CameraOptions
 
 SCENE = make_scene()
 NAMES = [f"frame_{i:03d}.png" for i in range(SCENE.tracks.num_frames)]
+CAMERAS = [CAMERA] * len(NAMES)
 ROWS = match_scene(SCENE, CAMERA)
 
 
@@ -93,14 +94,14 @@ def check_mapper_command(database: Path, folder: Path) -> None:
 
 def test_incremental_mapper_maps_a_new_database(tmp_path: Path) -> None:
     database = tmp_path / "new.db"
-    write_matches(database, NAMES, CAMERA, ROWS)
+    write_matches(database, NAMES, CAMERAS, ROWS)
     assert [p.name for p in tmp_path.iterdir()] == ["new.db"]
     check_incremental_mapper(database, tmp_path)
 
 
 def test_global_mapper_maps_a_new_database(tmp_path: Path) -> None:
     database = tmp_path / "new.db"
-    write_matches(database, NAMES, CAMERA, ROWS)
+    write_matches(database, NAMES, CAMERAS, ROWS)
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
     models = pycolmap.global_mapping(database, tmp_path, tmp_path / "model", options)
@@ -109,14 +110,14 @@ def test_global_mapper_maps_a_new_database(tmp_path: Path) -> None:
 
 @needs_colmap
 def test_colmap_command_maps_a_new_database(tmp_path: Path) -> None:
-    write_matches(tmp_path / "new.db", NAMES, CAMERA, ROWS)
+    write_matches(tmp_path / "new.db", NAMES, CAMERAS, ROWS)
     check_mapper_command(tmp_path / "new.db", tmp_path)
 
 
 @needs_colmap
 def test_new_database_has_the_schema_of_colmap_3_8(tmp_path: Path) -> None:
     colmap("database_creator", "--database_path", tmp_path / "colmap.db")
-    write_matches(tmp_path / "ours.db", NAMES, CAMERA, ROWS)
+    write_matches(tmp_path / "ours.db", NAMES, CAMERAS, ROWS)
     version = query(tmp_path / "colmap.db", "PRAGMA user_version")[0][0]
     if version // 100 != 38:
         pytest.skip(f"the colmap command is not 3.8 but {version}")
@@ -133,7 +134,7 @@ def test_new_database_has_the_schema_of_colmap_3_8(tmp_path: Path) -> None:
 
 
 def test_pycolmap_reads_the_written_rows(tmp_path: Path) -> None:
-    write_matches(tmp_path / "new.db", NAMES, CAMERA, ROWS)
+    write_matches(tmp_path / "new.db", NAMES, CAMERAS, ROWS)
     with pycolmap.Database.open(tmp_path / "new.db") as database:
         assert database.num_cameras() == 1
         camera = database.read_camera(1)
@@ -210,7 +211,7 @@ def test_images_imported_by_pycolmap_keep_their_rigs_and_are_mapped(tmp_path: Pa
 def test_matches_in_an_empty_database_of_pycolmap_are_mapped(tmp_path: Path) -> None:
     path = tmp_path / "empty.db"
     pycolmap.Database.open(path).close()
-    write_matches(path, NAMES, CAMERA, ROWS)
+    write_matches(path, NAMES, CAMERAS, ROWS)
     assert query(path, "SELECT COUNT(*) FROM frames") == [(0,)]
     check_incremental_mapper(path, tmp_path)
 
@@ -247,7 +248,7 @@ def test_each_image_can_have_its_own_camera(tmp_path: Path) -> None:
 
 def test_same_rows_give_identical_files(tmp_path: Path) -> None:
     for name in ("a.db", "b.db"):
-        write_matches(tmp_path / name, NAMES, CAMERA, ROWS)
+        write_matches(tmp_path / name, NAMES, CAMERAS, ROWS)
     digests = {hashlib.sha256(p.read_bytes()).digest() for p in tmp_path.iterdir()}
     assert len(digests) == 1
 
@@ -279,7 +280,7 @@ def test_columns_of_matches_are_in_order_of_image_ids(
     # hypothesis would run all examples with the same tmp_path.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "example.db"
-        write_matches(path, [names[i] for i in order], CAMERA, without_keypoints(4))
+        write_matches(path, [names[i] for i in order], CAMERAS[:4], without_keypoints(4))
         rows = MatchedImages(keypoints, pairs, matches, geometries, forward_motion=False)
         write_matches(path, names, None, rows)
         ids = {image.name: image.image_id for image in read_images(path)}
@@ -304,7 +305,7 @@ def without_keypoints(num_images: int) -> MatchedImages:
 
 def write_images_only(path: Path) -> None:
     """Write a database in the schema of COLMAP 3.8 with images and without keypoints."""
-    write_matches(path, NAMES, CAMERA, without_keypoints(len(NAMES)))
+    write_matches(path, NAMES, CAMERAS, without_keypoints(len(NAMES)))
 
 
 def write_text(path: Path) -> None:
@@ -316,11 +317,11 @@ def write_other_schema(path: Path) -> None:
 
 
 def write_with_matches(path: Path) -> None:
-    write_matches(path, NAMES, CAMERA, ROWS)
+    write_matches(path, NAMES, CAMERAS, ROWS)
 
 
 def write_other_images(path: Path) -> None:
-    write_matches(path, [f"x{name}" for name in NAMES], CAMERA, ROWS)
+    write_matches(path, [f"x{name}" for name in NAMES], CAMERAS, ROWS)
 
 
 def write_rigs_without_images(path: Path) -> None:
@@ -346,7 +347,7 @@ def test_refused_path_is_not_changed(
     prepare(path)
     before = path.read_bytes() if path.is_file() else None
     with pytest.raises(DatabaseError, match=message) as caught:
-        write_matches(path, NAMES, CAMERA, ROWS)
+        write_matches(path, NAMES, CAMERAS, ROWS)
     assert "\n" not in str(caught.value)
     assert (path.read_bytes() if path.is_file() else None) == before
     assert [p.name for p in tmp_path.iterdir()] == ["given.db"]
@@ -359,19 +360,19 @@ def test_special_files_are_refused_and_links_are_followed(tmp_path: Path) -> Non
     (tmp_path / "loop").symlink_to("loop")
     for name in ("pipe", "loop"):
         with pytest.raises(DatabaseError, match=name):
-            write_matches(tmp_path / name, NAMES, CAMERA, ROWS)
+            write_matches(tmp_path / name, NAMES, CAMERAS, ROWS)
         with pytest.raises(DatabaseError, match=name), open_unaltered(tmp_path / name):
             pass
     assert (tmp_path / "pipe").is_fifo()
     (tmp_path / "link").symlink_to("new.db")
-    write_matches(tmp_path / "link", NAMES, CAMERA, ROWS)
+    write_matches(tmp_path / "link", NAMES, CAMERAS, ROWS)
     assert (tmp_path / "link").is_symlink()
     assert len(read_images(tmp_path / "new.db")) == len(NAMES)
 
 
 def test_new_database_needs_an_existing_folder(tmp_path: Path) -> None:
     with pytest.raises(DatabaseError, match="folder"):
-        write_matches(tmp_path / "no" / "new.db", NAMES, CAMERA, ROWS)
+        write_matches(tmp_path / "no" / "new.db", NAMES, CAMERAS, ROWS)
 
 
 def test_new_database_is_refused_next_to_an_old_log(tmp_path: Path) -> None:
@@ -380,12 +381,12 @@ def test_new_database_is_refused_next_to_an_old_log(tmp_path: Path) -> None:
     (tmp_path / "link.db").symlink_to("new.db")
     for name in ("new.db", "link.db"):
         with pytest.raises(DatabaseError, match=r"new\.db-wal"):
-            write_matches(tmp_path / name, NAMES, CAMERA, ROWS)
+            write_matches(tmp_path / name, NAMES, CAMERAS, ROWS)
 
 
 def test_database_without_keypoints_but_with_matches_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "given.db"
-    write_matches(path, NAMES, CAMERA, ROWS)
+    write_matches(path, NAMES, CAMERAS, ROWS)
     alter(path, "DELETE FROM keypoints")
     with pytest.raises(DatabaseError, match="matches"):
         write_matches(path, NAMES, None, ROWS)
@@ -397,7 +398,7 @@ def test_missing_and_empty_files_have_no_images(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "empty.db").touch()
     assert read_images(tmp_path / "empty.db") == []
-    write_matches(tmp_path / "empty.db", NAMES, CAMERA, ROWS)
+    write_matches(tmp_path / "empty.db", NAMES, CAMERAS, ROWS)
     assert len(read_images(tmp_path / "empty.db")) == len(NAMES)
 
 
@@ -406,7 +407,7 @@ def test_reading_needs_no_write_permission_and_creates_no_file(tmp_path: Path) -
     folder = tmp_path / "closed"
     folder.mkdir()
     path = folder / "given.db"
-    write_matches(path, NAMES, CAMERA, ROWS)
+    write_matches(path, NAMES, CAMERAS, ROWS)
     query(path, "PRAGMA journal_mode = WAL")
     before = path.read_bytes()
     folder.chmod(0o500)
@@ -460,7 +461,7 @@ def test_interrupted_write_leaves_the_file_unchanged(tmp_path: Path, existing: b
 
     rows = replace(ROWS, geometries=Interrupting(ROWS.geometries))
     with pytest.raises(Interruption):
-        write_matches(path, NAMES, CAMERA, rows)
+        write_matches(path, NAMES, CAMERAS, rows)
     assert (path.read_bytes() if existing else None) == before
     assert [p.name for p in tmp_path.iterdir()] == (["given.db"] if existing else [])
 
@@ -489,7 +490,7 @@ def test_failed_write_leaves_the_file_unchanged(tmp_path: Path, existing: bool) 
     script = """
         import os, resource, signal, sys
         sys.path[:0] = sys.argv[2].split(os.pathsep)
-        from test_rows import CAMERA, NAMES, ROWS
+        from test_rows import CAMERAS, NAMES, ROWS
         from colmap_av1.database.writing import write_matches
         from colmap_av1.errors import DatabaseError
 
@@ -497,7 +498,7 @@ def test_failed_write_leaves_the_file_unchanged(tmp_path: Path, existing: bool) 
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
         try:
-            write_matches(sys.argv[1], NAMES, CAMERA, ROWS)
+            write_matches(sys.argv[1], NAMES, CAMERAS, ROWS)
         except DatabaseError as error:
             print(error)
     """
@@ -541,7 +542,7 @@ def test_every_camera_model_is_read_back_as_written(tmp_path: Path, model: str) 
     default = make_camera(CameraOptions(model), WIDTH, HEIGHT)
     text = ",".join(str(p + 0.25) for p in default.params)
     camera = make_camera(CameraOptions(model, text), WIDTH, HEIGHT)
-    write_matches(tmp_path / "new.db", NAMES, camera, ROWS)
+    write_matches(tmp_path / "new.db", NAMES, [camera] * len(NAMES), ROWS)
     stored = read_cameras(tmp_path / "new.db")[1]
     assert stored.model_name == model
     assert stored.params.tolist() == [p + 0.25 for p in default.params]

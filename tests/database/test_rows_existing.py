@@ -16,7 +16,7 @@ import pycolmap
 import pytest
 from colmap_command import COLMAP, colmap, needs_colmap
 from existing_database import (
-    CAMERA,
+    CAMERAS,
     LAYOUTS,
     NAMES,
     NUM_IMAGES,
@@ -306,7 +306,7 @@ def test_geometry_with_more_inliers_is_kept_when_merged(
     (their_config, their_inliers), (our_config, our_inliers) = theirs, ours
     config, inliers, F = merged
     path = tmp_path / "given.db"
-    write_matches(path, NAMES[:2], CAMERA, one_pair(their_inliers, TwoViewConfig.UNCALIBRATED))
+    write_matches(path, NAMES[:2], CAMERAS[:2], one_pair(their_inliers, TwoViewConfig.UNCALIBRATED))
     alter(
         path,
         "UPDATE two_view_geometries SET config = ?, F = ?",
@@ -334,7 +334,7 @@ def test_inliers_become_the_matches_of_a_pair_without_matches(tmp_path: Path) ->
     matches and a geometry.
     """
     path = tmp_path / "given.db"
-    write_matches(path, NAMES[:2], CAMERA, one_pair(40, TwoViewConfig.UNCALIBRATED))
+    write_matches(path, NAMES[:2], CAMERAS[:2], one_pair(40, TwoViewConfig.UNCALIBRATED))
     alter(path, "DELETE FROM matches")
     rows = one_pair(30, TwoViewConfig.UNCALIBRATED)
     rows.keypoints[0].xy[:] += 0.5
@@ -369,10 +369,10 @@ def test_images_are_added_with_their_frames(tmp_path: Path, layout: str, mode: O
     path = tmp_path / "given.db"
     list_images(path, layout, NAMES[:4])
     with pytest.raises(DatabaseError, match="4 images"):
-        write_matches(path, NAMES, CAMERA, OURS)
+        write_matches(path, NAMES, CAMERAS, OURS)
     with pytest.raises(DatabaseError, match="4 images"):
         write_matches(path, NAMES, None, OURS, on_existing=mode)
-    write_matches(path, NAMES, CAMERA, OURS, on_existing=mode)
+    write_matches(path, NAMES, CAMERAS, OURS, on_existing=mode)
     images = read_images(path)
     assert {i.name: i.camera_id for i in images} == {
         name: 1 if name in NAMES[:4] else 2 for name in NAMES
@@ -533,7 +533,7 @@ def test_partial_file_of_a_killed_process_is_removed(tmp_path: Path) -> None:
     assert partial.name.startswith(".new [1].db.")
     try:
         # The first process is still writing the partial file, which must stay.
-        write_matches(path, NAMES, CAMERA, OURS)
+        write_matches(path, NAMES, CAMERAS, OURS)
         assert sorted(p.name for p in tmp_path.iterdir()) == [partial.name, path.name]
     finally:
         kill(process)
@@ -541,7 +541,7 @@ def test_partial_file_of_a_killed_process_is_removed(tmp_path: Path) -> None:
     path.unlink()
     # A file with a similar name that no process of this package wrote must stay, too.
     (tmp_path / ".new [1].db.1.partial").touch()
-    write_matches(path, NAMES, CAMERA, OURS)
+    write_matches(path, NAMES, CAMERAS, OURS)
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         ".new [1].db.1.partial",
         path.name,
@@ -554,7 +554,7 @@ def test_replaced_database_keeps_cameras_and_other_tables(tmp_path: Path) -> Non
     fill_with_sift(path, ids)
     alter(path, "INSERT INTO pose_priors VALUES (?, ?, 0, NULL)", 1, np.ones(3).tobytes())
     before = content(path)
-    write_matches(path, NAMES, CAMERA, OURS, on_existing="replace")
+    write_matches(path, NAMES, CAMERAS, OURS, on_existing="replace")
     after = content(path)
     for table in ("cameras", "images", "pose_priors"):
         assert after[table] == before[table]

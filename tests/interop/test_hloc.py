@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
-from existing_database import CAMERA, NAMES, OURS, THEIRS, alter, make_existing, make_layout, query
+from existing_database import CAMERAS, NAMES, OURS, THEIRS, alter, make_existing, make_layout, query
 from synthetic_scene import HEIGHT, WIDTH
 
 from colmap_av1.cli import main
@@ -78,7 +78,7 @@ def test_layout_matches_hloc(tmp_path: Path) -> None:
     write_matches(
         path,
         names,
-        CAMERA,
+        CAMERAS[:3],
         MatchedImages(
             [ImageKeypoints(i, xy + i, np.arange(3)) for i in range(3)],
             np.array([[0, 2]], np.int32),
@@ -121,7 +121,7 @@ def test_positions_near_the_edge_are_exact(tmp_path: Path) -> None:
         [geometry],
         forward_motion=False,
     )
-    write_matches(tmp_path / "a.db", NAMES[:3], CAMERA, rows)
+    write_matches(tmp_path / "a.db", NAMES[:3], CAMERAS[:3], rows)
     export_hloc(tmp_path / "a.db", tmp_path)
     found = read_folder(tmp_path)
     assert np.array_equal(found.keypoints[0], keypoints.xy)
@@ -140,7 +140,7 @@ def test_many_keypoints_need_wider_integers(tmp_path: Path) -> None:
     write_matches(
         tmp_path / "a.db",
         NAMES[:2],
-        CAMERA,
+        CAMERAS[:2],
         MatchedImages(
             keypoints,
             np.array([[0, 1]], np.int32),
@@ -154,7 +154,7 @@ def test_many_keypoints_need_wider_integers(tmp_path: Path) -> None:
 
 
 def test_same_database_gives_the_same_bytes(tmp_path: Path) -> None:
-    write_matches(tmp_path / "a.db", NAMES, CAMERA, OURS)
+    write_matches(tmp_path / "a.db", NAMES, CAMERAS, OURS)
     for folder in ("a", "b"):
         export_hloc(tmp_path / "a.db", tmp_path / folder)
     for name in FILES:
@@ -165,7 +165,7 @@ def test_hloc_reconstructs_from_the_files(tmp_path: Path) -> None:
     """Runs hloc itself if it is installed."""
     pytest.importorskip("hloc.reconstruction", reason="hloc is not installed")
     database, images = tmp_path / "a.db", tmp_path / "images"
-    write_matches(database, NAMES, CAMERA, OURS)
+    write_matches(database, NAMES, CAMERAS, OURS)
     export_hloc(database, tmp_path)
     images.mkdir()
     for name in NAMES:
@@ -297,7 +297,7 @@ def test_failures_leave_nothing(tmp_path: Path) -> None:
 
 
 def test_export_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_matches(tmp_path / "a.db", NAMES, CAMERA, OURS)
+    write_matches(tmp_path / "a.db", NAMES, CAMERAS, OURS)
     words = ["export", "--database", str(tmp_path / "a.db"), "--output", str(tmp_path / "h")]
     assert main([*words, "--verified", "0"]) == 0
     table = dict(line.split("\t") for line in capsys.readouterr().out.splitlines())

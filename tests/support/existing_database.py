@@ -20,6 +20,7 @@ LAYOUTS = ("3.8", "3.11", "3.13", "4.2")
 NUM_IMAGES = 8
 NAMES = [f"frame_{i:03d}.png" for i in range(NUM_IMAGES)]
 CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
+CAMERAS = [CAMERA] * NUM_IMAGES
 # Different points, observed by the same cameras.
 THEIR_SCENE, OUR_SCENE = (
     make_scene(num_frames=NUM_IMAGES, num_points=500, seed=seed) for seed in (1, 2)

@@ -35,7 +35,7 @@ _WAITING = """
         return connection
     database_file.sqlite3.connect = connect_small
     new_rows = dataclasses.replace(new_rows, geometries=Waiting(new_rows.geometries))
-    images = (data.NAMES, data.CAMERA)
+    images = (data.NAMES, data.CAMERAS)
     database.write_matches(sys.argv[1], *images, new_rows, on_existing=sys.argv[5])
 """
 
@@ -45,7 +45,7 @@ def start_writing(
 ) -> subprocess.Popen[str]:
     """Start a process that writes most rows and then waits inside its transaction.
 
-    `module` is a module of the tests with NAMES, CAMERA and the rows, in a variable named `rows`.
+    `module` is a module of the tests with NAMES, CAMERAS and the rows, in a variable named `rows`.
     """
     script = textwrap.dedent(_WAITING)
     process = subprocess.Popen(

@@ -15,7 +15,6 @@ from colmap_av1.options import CameraOptions, DensityOptions, MatchOptions, Pair
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import least_length
 from colmap_av1.tracks.video_tracks import open_source
-from colmap_av1.util.cpus import cpu_seconds
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
@@ -96,11 +95,12 @@ def convert(
 
     def make() -> Conversion | None:
         context = RunContext.of(options.run, progress)
-        start = cpu_seconds()
         with open_source(video, options.source, next_to=folder, context=context) as source:
             is_new = source.conversion is not None and not source.is_reused
-        cost = Conversion(context.clock.seconds.get("encoding", 0.0), cpu_seconds() - start)
-        return cost if is_new else None
+        if not is_new:
+            return None
+        clock = context.clock
+        return Conversion(clock.seconds["encoding"], clock.cpu_seconds["encoding"])
 
     # Other code than that of the conversion does not change the cost of the stream that is kept.
     depends_on = [file_digest(video.path), options.encode, options.reencode]

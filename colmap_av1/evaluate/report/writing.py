@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +38,7 @@ from colmap_av1.images.files import read_image
 from colmap_av1.util.digests import package_version
 from colmap_av1.util.files import whole_file
 from colmap_av1.util.pages import render_page
-from colmap_av1.util.plain import plain
+from colmap_av1.util.plain import json_text
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def _json(report: CompareReport) -> str:
         if column.cloud is not None:
             result["cloud"]["chamfer"] = column.cloud.chamfer
     facts["versions"] = _versions()
-    return json.dumps(plain(facts), indent=1) + "\n"
+    return json_text(facts)
 
 
 def _versions() -> dict[str, str]:
