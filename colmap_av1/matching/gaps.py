@@ -157,25 +157,6 @@ def fast_frames(tracks: Tracks) -> Bools:
     return np.asarray(sliding_window_view(fast, 2 * _LASTING_FRAMES + 1).any(axis=1))
 
 
-def should_examine_pictures(
-    inter_share: NDArray[np.float32],
-    frames: NDArray[np.int32],
-    tracks: Tracks,
-    *,
-    fast: Bools,
-    links: LinkOptions,
-    min_length: int,
-) -> bool:
-    """Whether pictures are examined if no two images share enough tracks.
-
-    The pictures may connect the images, or show why there are no tracks. That reason is clear
-    without them if the video is shorter than `min_length`, the fewest frames of a track.
-    """
-    lacks_tracks = tracks.num_tracks == 0 and tracks.num_frames >= min_length
-    is_doubtful = fast[frames].any() or low_inter_gaps(inter_share, frames).any()
-    return links.links == "sift" or (links.links == "auto" and bool(lacks_tracks or is_doubtful))
-
-
 def probed_gaps(inter_share: NDArray[np.float32], low: Bools, options: LinkOptions) -> list[int]:
     """Choose gaps at which to compare motion with the pictures, to decide whether to trust it.
 

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.errors import VideoError
 from colmap_av1.images.image_set import ImageSet, Pictures
 from colmap_av1.matching.cameras import ImageCameras
 from colmap_av1.matching.depth import DepthEvidence, depth_of_images
-from colmap_av1.matching.gaps import should_examine_pictures
 from colmap_av1.matching.links.link_images import link_images
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.matched_images import (
     MatchedImages,
     PairedImages,
     join_videos,
-    pair_images,
+    pair_by_tracks,
     verify_images,
 )
+from colmap_av1.matching.pairs import schedule_pairs
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.util.arrays import Bools, Ints
@@ -134,27 +136,22 @@ def pair_videos(
     context: RunContext,
     name: str,
 ) -> PairedImages:
-    """Match the images of each video along its tracks, see `match_images`."""
-    paired = []
-    for number, video in enumerate(videos):
-        chosen = image_set.of_video(number)
-        examines_pictures = should_examine_pictures(
-            video.inter_share,
-            chosen.frames,
-            video.tracks,
-            fast=video.fast,
-            links=options.links,
-            min_length=least_length(options.tracks),
+    """Match the images of each video along its tracks, see `match_images`.
+
+    Raises:
+        VideoError: a single video is shorter than a track.
+    """
+    num_frames, least = videos[0].tracks.num_frames, least_length(options.tracks)
+    if image_set.num_sequences == 1 and num_frames < least:
+        shorter = ", or --min_length 2" if num_frames > 2 else ""
+        raise VideoError(
+            f"{name}: the video has {num_frames} frames, a track needs {least}: give a longer "
+            f"video{shorter}"
         )
-        paired.append(
-            pair_images(
-                name,
-                video.tracks,
-                chosen,
-                options.pairs,
-                min_length=least_length(options.tracks),
-                context=context,
-                needed=image_set.num_sequences == 1 and not examines_pictures,
-            )
-        )
-    return join_videos(paired, image_set)
+    choose = partial(schedule_pairs, options=options.pairs)
+    with context.clock.measure("pairs"):
+        paired = [
+            pair_by_tracks(own.tracks, image_set.of_video(video).frames, choose, context.progress)
+            for video, own in enumerate(videos)
+        ]
+        return join_videos(paired, image_set)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,6 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
-from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.mapper_limits import INITIAL_MAX_FORWARD_MOTION, MIN_INLIERS
 from colmap_av1.matching.pairs import (
@@ -18,7 +17,6 @@ from colmap_av1.matching.pairs import (
     image_keypoints,
     next_track,
     pair_matches,
-    schedule_pairs,
 )
 from colmap_av1.matching.two_view_geometry import UNUSED_CONFIGS, TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.verify import verify_pairs
@@ -26,7 +24,7 @@ from colmap_av1.options import PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.graphs import connected_components
-from colmap_av1.util.progress import progress_in
+from colmap_av1.util.progress import Progress, no_progress, progress_in
 from colmap_av1.util.run_context import RunContext
 
 
@@ -69,45 +67,27 @@ class MatchedImages(PairedImages):
         return np.array([len(own.inlier_matches) for own in self.geometries], np.int64)
 
 
-def pair_images(
-    name: str,
+def pair_by_tracks(
     tracks: Tracks,
-    chosen: ChosenImages,
-    options: PairOptions,
-    *,
-    min_length: int,
-    context: RunContext,
-    needed: bool = True,
+    frames: NDArray[np.int32],
+    choose: Callable[[list[ImageKeypoints]], NDArray[np.int32]],
+    progress: Progress = no_progress,
 ) -> PairedImages:
-    """Match the images of a video along its tracks.
+    """Match the images of a video along tracks.
 
     Args:
-        name: name of the video in messages.
-        tracks: tracks of the whole video.
-        chosen: the images.
-        options: which images are paired.
-        min_length: fewest frames of a track.
-        context: its clock and progress get the stage "pairs".
-        needed: raise if no two images share enough tracks.
-
-    Raises:
-        VideoError: no two images share enough tracks.
+        tracks: the tracks.
+        frames: int32 [num_images] the frame of each image, ascending.
+        choose: chooses the pairs, int32 [m, 2], from the keypoints, see `schedule_pairs` and
+            `covisible_pairs`.
+        progress: called with the stage "pairs".
     """
-    with context.clock.measure("pairs"):
-        keypoints = image_keypoints(tracks, chosen.frames.tolist())
-        pairs = schedule_pairs(keypoints, options)
-        if needed and tracks.num_frames < min_length:
-            shorter = ", or --min_length 2" if tracks.num_frames > 2 else ""
-            raise VideoError(
-                f"{name}: the video has {tracks.num_frames} frames, a track needs {min_length}: "
-                f"give a longer video{shorter}"
-            )
-        if needed and len(pairs) == 0:
-            raise nothing_to_match(name, options)
-        matches = []
-        for i, j in pairs:
-            matches.append(pair_matches(keypoints[i], keypoints[j]))
-            context.progress("pairs", len(matches), len(pairs))
+    keypoints = image_keypoints(tracks, frames.tolist())
+    pairs = choose(keypoints)
+    matches = []
+    for i, j in pairs.tolist():
+        matches.append(pair_matches(keypoints[i], keypoints[j]))
+        progress("pairs", len(matches), len(pairs))
     return PairedImages(keypoints, pairs, matches)
 
 
@@ -132,18 +112,14 @@ def join_videos(videos: Sequence[PairedImages], image_set: ImageSet) -> PairedIm
     keypoints: list[ImageKeypoints] = []
     pairs, matches = [np.empty((0, 2), np.int32)], []
     first_track = 0
-    for video, own in enumerate(videos):
-        first_frame = int(image_set.first_frame[video])
+    for own in videos:
         pairs.append((own.pairs + len(keypoints)).astype(np.int32))
         matches += own.matches
-        keypoints += [
-            replace(k, frame=k.frame + first_frame, track=k.track + first_track)
-            for k in own.keypoints
-        ]
+        keypoints += [replace(k, track=k.track + first_track) for k in own.keypoints]
         first_track += next_track(own.keypoints)
     no_xy, no_track = np.empty((0, 2), np.float32), np.empty(0, np.int64)
-    photos = image_set.images.frames[len(keypoints) :]
-    keypoints += [ImageKeypoints(int(frame), no_xy, no_track) for frame in photos]
+    num_photos = len(image_set.sequence) - len(keypoints)
+    keypoints += [ImageKeypoints(no_xy, no_track)] * num_photos
     return PairedImages(keypoints, np.concatenate(pairs), matches)
 
 

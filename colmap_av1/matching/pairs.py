@@ -29,13 +29,11 @@ class ImageKeypoints:
     """Keypoints of one image, one for each track that it observes.
 
     Attributes:
-        frame: frame number of the image's video frame.
         xy: float32 [n, 2] position in pixels, (x right, y down), origin at the top-left
             corner of the image: the first pixel's centre is (0.5, 0.5).
         track: int64 [n] track of each keypoint, strictly ascending.
     """
 
-    frame: int
     xy: NDArray[np.float32]
     track: Ints
 
@@ -82,7 +80,6 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
     # Observations are ordered by track, so a stable sort by image keeps tracks ascending.
     return [
         ImageKeypoints(
-            frame=int(frame),
             xy=np.ascontiguousarray(tracks.xy[kept[own]], dtype=np.float32),
             track=track[kept[own]],
         )

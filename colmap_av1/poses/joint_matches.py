@@ -21,7 +21,7 @@ from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.mapper_limits import POINT_MIN_ANGLE
 from colmap_av1.matching.match_images import ImageMatches
-from colmap_av1.matching.matched_images import PairedImages, verify_images
+from colmap_av1.matching.matched_images import PairedImages, pair_by_tracks, verify_images
 from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.adjustment_stage import AdjustedResult
@@ -39,7 +39,7 @@ from colmap_av1.poses.matched_observations import (
 from colmap_av1.poses.posed import Posed
 from colmap_av1.poses.posed_images import PosedImages, posed_images_of, read_poses, triangulate_in
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_matches import at_same_place, pair_by_tracks, tracks_of_model
+from colmap_av1.poses.track_matches import at_same_place, tracks_of_model
 from colmap_av1.poses.track_stage import VideoTracks, pose_tracks
 from colmap_av1.poses.unregistered import models_of_images, tracks_of_unregistered, within_models
 from colmap_av1.tracks.selection import select_tracks

@@ -28,7 +28,7 @@ from colmap_av1.errors import ModelError
 from colmap_av1.geometry.cameras import with_initial_intrinsics
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors, write_posed_model
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.matching.matched_images import verify_images
+from colmap_av1.matching.matched_images import pair_by_tracks, verify_images
 from colmap_av1.matching.pairs import covisible_pairs
 from colmap_av1.options import MapOptions
 from colmap_av1.poses.adjusting import adjust_posed, mean_cost, refines_intrinsics
@@ -37,7 +37,7 @@ from colmap_av1.poses.longest_tracks import keep_longest_tracks
 from colmap_av1.poses.mapping_stage import MappedResult, mapped_models
 from colmap_av1.poses.posed_images import FROM_PICTURES, posed_images_of, read_poses, triangulate_in
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_matches import pair_by_tracks, tracks_of_model
+from colmap_av1.poses.track_matches import tracks_of_model
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 

@@ -1,22 +1,15 @@
-"""Tracks of models, and pairs of images that share tracks, however far apart they are."""
+"""Tracks of models, and their positions compared with those of other tracks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.cameras import largest_size
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.geometry.track_points import tracks_of_points
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.matching.matched_images import PairedImages
-from colmap_av1.matching.pairs import ImageKeypoints, image_keypoints, pair_matches
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Ints
-
-Pairs = NDArray[np.int32]
 
 
 def tracks_of_model(model: PosedModel, image_set: ImageSet) -> Tracks:
@@ -51,19 +44,3 @@ def at_same_place(tracks: Tracks, others: Tracks, distance: float) -> Bools:
     around = np.array([dy * columns + dx for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
     is_there = np.isin(cells(tracks), (cells(others)[:, None] + around).ravel())
     return tracks.having(is_there)
-
-
-def pair_by_tracks(
-    tracks: Tracks, frames: NDArray[np.int32], choose: Callable[[list[ImageKeypoints]], Pairs]
-) -> PairedImages:
-    """Match images along tracks.
-
-    Args:
-        tracks: the tracks.
-        frames: int32 [num_images] the frame of each image, ascending.
-        choose: chooses the pairs, int32 [m, 2], from the keypoints, see `covisible_pairs`.
-    """
-    keypoints = image_keypoints(tracks, frames.tolist())
-    pairs = choose(keypoints)
-    matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs.tolist()]
-    return PairedImages(keypoints, pairs, matches)

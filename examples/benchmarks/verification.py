@@ -144,7 +144,7 @@ def verify_here(database: Path) -> Verified:
         keypoints = []
         for image in images:
             xy = np.asarray(db.read_keypoints(image.image_id), dtype=np.float32)[:, :2]
-            keypoints.append(ImageKeypoints(0, np.ascontiguousarray(xy), np.arange(len(xy))))
+            keypoints.append(ImageKeypoints(np.ascontiguousarray(xy), np.arange(len(xy))))
         pair_ids, matches = db.read_all_matches()
     index = {image.image_id: k for k, image in enumerate(images)}
     pairs = np.array(

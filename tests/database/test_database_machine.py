@@ -93,7 +93,6 @@ def new_rows(seed: int) -> MatchedImages:
     rng = np.random.default_rng(seed)
     keypoints = [
         ImageKeypoints(
-            frame=frame,
             xy=rng.uniform(0, 100, (NUM_KEYPOINTS, 2)).astype(np.float32),
             track=np.arange(NUM_KEYPOINTS, dtype=np.int64),
         )

@@ -273,9 +273,7 @@ def test_columns_of_matches_are_in_order_of_image_ids(
     ]
     F = np.arange(9.0).reshape(3, 3)
     geometries = [TwoViewGeometry(TwoViewConfig.UNCALIBRATED, m[::2], F=F) for m in matches]
-    keypoints = [
-        ImageKeypoints(i, np.full((10, 2), i, np.float32), np.arange(10)) for i in range(4)
-    ]
+    keypoints = [ImageKeypoints(np.full((10, 2), i, np.float32), np.arange(10)) for i in range(4)]
     names = [f"{i}.jpg" for i in range(4)]
     # hypothesis would run all examples with the same tmp_path.
     with tempfile.TemporaryDirectory() as folder:
@@ -298,7 +296,7 @@ def test_columns_of_matches_are_in_order_of_image_ids(
 
 
 def without_keypoints(num_images: int) -> MatchedImages:
-    nothing = ImageKeypoints(0, np.empty((0, 2), np.float32), np.empty(0))
+    nothing = ImageKeypoints(np.empty((0, 2), np.float32), np.empty(0))
     pairs = np.empty((0, 2), np.int32)
     return MatchedImages([nothing] * num_images, pairs, [], [], forward_motion=False)
 

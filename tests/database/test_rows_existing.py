@@ -265,7 +265,7 @@ def one_pair(num: int, config: TwoViewConfig) -> MatchedImages:
     xy = np.arange(200, dtype=np.float32).reshape(100, 2)
     inliers = np.repeat(np.arange(num, dtype=np.uint32), 2).reshape(num, 2)
     return MatchedImages(
-        [ImageKeypoints(i, xy + i, np.arange(100)) for i in range(2)],
+        [ImageKeypoints(xy + i, np.arange(100)) for i in range(2)],
         np.array([[0, 1]], np.int32),
         [np.repeat(np.arange(60, dtype=np.uint32), 2).reshape(60, 2)],
         [TwoViewGeometry(config, inliers, F=np.full((3, 3), float(num)))],

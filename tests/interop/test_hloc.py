@@ -80,7 +80,7 @@ def test_layout_matches_hloc(tmp_path: Path) -> None:
         names,
         CAMERAS[:3],
         MatchedImages(
-            [ImageKeypoints(i, xy + i, np.arange(3)) for i in range(3)],
+            [ImageKeypoints(xy + i, np.arange(3)) for i in range(3)],
             np.array([[0, 2]], np.int32),
             [matches],
             [geometry],
@@ -110,8 +110,8 @@ def test_layout_matches_hloc(tmp_path: Path) -> None:
 def test_positions_near_the_edge_are_exact(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     xy = np.concatenate([rng.uniform(0, 1, (500, 2)), rng.uniform(0, 4000, (500, 2))])
-    keypoints = ImageKeypoints(0, xy.astype(np.float32), np.arange(1000))
-    none = ImageKeypoints(1, np.empty((0, 2), np.float32), np.empty(0, np.int64))
+    keypoints = ImageKeypoints(xy.astype(np.float32), np.arange(1000))
+    none = ImageKeypoints(np.empty((0, 2), np.float32), np.empty(0, np.int64))
     matches = np.array([[7, 8]], np.uint32)
     geometry = TwoViewGeometry(TwoViewConfig.UNCALIBRATED, matches, F=np.eye(3))
     rows = MatchedImages(
@@ -135,7 +135,7 @@ def test_positions_near_the_edge_are_exact(tmp_path: Path) -> None:
 
 def test_many_keypoints_need_wider_integers(tmp_path: Path) -> None:
     xy = np.zeros((40000, 2), np.float32)
-    keypoints = [ImageKeypoints(i, xy, np.arange(40000)) for i in range(2)]
+    keypoints = [ImageKeypoints(xy, np.arange(40000)) for i in range(2)]
     matches = np.array([[3, 39999]], np.uint32)
     write_matches(
         tmp_path / "a.db",

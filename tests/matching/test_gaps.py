@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from image_sets import tracks_from
 from numpy.typing import NDArray
 
 from colmap_av1.matching.few_matches import few_match_gaps, few_matches_warning
-from colmap_av1.matching.gaps import Gap, low_inter_frames, low_inter_gaps, should_examine_pictures
-from colmap_av1.options import LinkOptions
+from colmap_av1.matching.gaps import Gap, low_inter_frames, low_inter_gaps
 
 NUM_IMAGES = 30
 REACH = 6
@@ -137,18 +133,3 @@ def test_low_inter_gaps_lie_between_images() -> None:
     share[[7, 13]] = 0.05
     gaps = low_inter_gaps(share, np.array([0, 3, 6, 9, 12, 15, 18]))
     assert np.flatnonzero(gaps).tolist() == [2, 4]
-
-
-@pytest.mark.parametrize(("links", "is_fast"), [("auto", True), ("auto", False), ("none", True)])
-def test_pictures_connect_images_where_the_camera_moves_fast(
-    links: Literal["auto", "none"], is_fast: bool
-) -> None:
-    """There, tracks are too short for images that are far apart."""
-    fast = np.full(NUM_IMAGES, is_fast)
-    frames = np.arange(0, NUM_IMAGES, 10, dtype=np.int32)
-    shares = np.full(NUM_IMAGES, 0.9, np.float32)
-    tracks = tracks_from([[frame, frame + 1] for frame in range(NUM_IMAGES - 1)])
-    found = should_examine_pictures(
-        shares, frames, tracks, fast=fast, links=LinkOptions(links), min_length=2
-    )
-    assert found == (is_fast and links == "auto")

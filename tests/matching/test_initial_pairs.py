@@ -44,9 +44,9 @@ def two_views(
     turn = Rotation.from_euler("y", -angle / 2, degrees=True).as_matrix()
     moved = (points - [np.radians(angle), 0, 0]) @ turn.T
     keypoints = []
-    for frame, seen in enumerate((points, moved)):
+    for seen in (points, moved):
         xy = CAMERA.img_from_cam(seen) + rng.normal(0, 0.15, (count, 2))
-        keypoints.append(ImageKeypoints(frame, xy.astype(np.float32), np.arange(count)))
+        keypoints.append(ImageKeypoints(xy.astype(np.float32), np.arange(count)))
     own = np.arange(count, dtype=np.uint32)
     return keypoints, np.c_[own, own]
 
@@ -59,9 +59,9 @@ def turned_views(
     points = np.c_[x, np.ones(count)] * (1 + rng.uniform(-depth, depth, count))[:, None]
     moved = points @ TURN.T + TURNED[:, 3]
     keypoints = []
-    for frame, seen in enumerate((points, moved)):
+    for seen in (points, moved):
         xy = CAMERA.img_from_cam(seen) + rng.normal(0, 0.3, (count, 2))
-        keypoints.append(ImageKeypoints(frame, xy.astype(np.float32), np.arange(count)))
+        keypoints.append(ImageKeypoints(xy.astype(np.float32), np.arange(count)))
     own = np.arange(count, dtype=np.uint32)
     return keypoints, np.c_[own, own]
 
@@ -201,7 +201,7 @@ def test_pair_with_few_inliers_is_demoted_if_no_pair_has_a_large_angle() -> None
     rng = np.random.default_rng(0)
     pairs = np.array([[0, 1], [2, 9], [3, 4]], dtype=np.int32)
     nothing = np.empty((0, 2), np.float32)
-    keypoints = [ImageKeypoints(i, nothing, np.arange(0)) for i in range(10)]
+    keypoints = [ImageKeypoints(nothing, np.arange(0)) for i in range(10)]
     poses = [np.eye(3, 4) for _ in range(10)]
     geometries = []
     for (i, j), count, angle in zip(pairs.tolist(), (400, 80, 80), (12.0, 7.0, 7.0), strict=True):
@@ -231,7 +231,7 @@ def num_inliers(
     """
     models = models or [0] * len(views)
     nothing = np.empty((0, 2), np.float32)
-    keypoints = [ImageKeypoints(i, nothing, np.arange(0)) for i in range(8 * len(views))]
+    keypoints = [ImageKeypoints(nothing, np.arange(0)) for i in range(8 * len(views))]
     known: list[list[NDArray[np.float64] | None]] = [
         [None] * len(keypoints) for _ in range(1 + max(models))
     ]
@@ -256,7 +256,6 @@ def towards_a_wall(rng: np.random.Generator) -> tuple[list[ImageKeypoints], NDAr
     wall = np.c_[x, np.ones(600)] / (1 + 1.5 * x[:, :1])
     keypoints = [
         ImageKeypoints(
-            frame,
             (CAMERA.img_from_cam(points) + rng.normal(0, 0.1, (600, 2))).astype(np.float32),
             np.arange(600),
         )

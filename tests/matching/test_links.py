@@ -183,7 +183,7 @@ def test_tracks_of_links_have_one_observation_per_frame(
 def test_inliers_of_merged_links_are_among_the_matches() -> None:
     """A link replaces the match of a track that is an outlier."""
     xy = np.array([[10.0, 10.0], [50.0, 10.0]], np.float32)
-    keypoints = [ImageKeypoints(frame, xy, np.arange(2)) for frame in range(2)]
+    keypoints = [ImageKeypoints(xy, np.arange(2)) for frame in range(2)]
     pair, same = np.array([[0, 1]], np.int32), np.array([[0, 0], [1, 1]], np.uint32)
     tracks = TwoViewGeometry(TwoViewConfig.CALIBRATED, same[:1])
     matched = MatchedImages(keypoints, pair, [same], [tracks], False)

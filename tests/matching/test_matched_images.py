@@ -1,40 +1,30 @@
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pytest
 from synthetic_scene import CAMERA_PARAMS, make_scene
 from walking_camera import FOCAL, HEIGHT, NUM_FRAMES, WIDTH, seen_by, walk
 
-from colmap_av1.errors import VideoError
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.matching.cameras import shared_focal_length
-from colmap_av1.matching.matched_images import PairedImages, pair_images, verify_images
+from colmap_av1.matching.matched_images import PairedImages, pair_by_tracks, verify_images
+from colmap_av1.matching.pairs import schedule_pairs
 from colmap_av1.options import CameraOptions, PairOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 
 CONTEXT = RunContext()
 KNOWN = CameraOptions("SIMPLE_RADIAL", CAMERA_PARAMS)
 
 
-def every_frame(tracks: Tracks) -> ChosenImages:
+def paired(
+    tracks: Tracks, options: PairOptions = PairOptions(), progress: Progress = no_progress
+) -> PairedImages:
     frames = np.arange(tracks.num_frames, dtype=np.int32)
-    return ChosenImages([f"{i}.png" for i in frames], frames)
-
-
-def paired(tracks: Tracks, **options: int) -> PairedImages:
-    return pair_images(
-        Path("walk.mp4"),
-        tracks,
-        every_frame(tracks),
-        PairOptions(min_matches=options.get("min_matches", 15)),
-        min_length=options.get("min_length", 3),
-        context=CONTEXT,
-    )
+    return pair_by_tracks(tracks, frames, partial(schedule_pairs, options=options), progress)
 
 
 def approach() -> Tracks:
@@ -47,27 +37,12 @@ def approach() -> Tracks:
 def test_pairs_match_keypoints_of_the_same_track() -> None:
     tracks = make_scene(num_frames=6).tracks
     steps: list[tuple[str, int, int | None]] = []
-    found = pair_images(
-        Path("walk.mp4"),
-        tracks,
-        every_frame(tracks),
-        PairOptions(offsets=(1,), growth=1.0),
-        min_length=3,
-        context=replace(CONTEXT, progress=lambda *step: steps.append(step)),
-    )
+    found = paired(tracks, PairOptions(offsets=(1,), growth=1.0), lambda *step: steps.append(step))
     assert found.pairs.tolist() == [[i, i + 1] for i in range(5)]
     assert steps[-1] == ("pairs", 5, 5)
     for (i, j), matches in zip(found.pairs, found.matches, strict=True):
         a, b = (found.keypoints[k].track[matches[:, s]] for s, k in enumerate((i, j)))
         np.testing.assert_array_equal(a, b)
-
-
-def test_too_few_matches_are_an_error() -> None:
-    tracks = make_scene(num_frames=5).tracks
-    with pytest.raises(VideoError, match="--min_length"):
-        paired(tracks, min_length=6)
-    with pytest.raises(VideoError, match="10000"):
-        paired(tracks, min_matches=10**4)
 
 
 def test_focal_length_is_estimated_unless_given() -> None:

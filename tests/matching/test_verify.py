@@ -242,7 +242,7 @@ def test_random_or_few_matches_are_degenerate() -> None:
     n = 60
     track = np.arange(n)
     images = [
-        ImageKeypoints(i, rng.uniform(0, [WIDTH, HEIGHT], (n, 2)).astype(np.float32), track)
+        ImageKeypoints(rng.uniform(0, [WIDTH, HEIGHT], (n, 2)).astype(np.float32), track)
         for i in range(2)
     ]
     matches = np.repeat(np.arange(n, dtype=np.uint32)[:, None], 2, axis=1)
@@ -259,7 +259,7 @@ def test_random_or_few_matches_are_degenerate() -> None:
 
 def test_still_camera_is_panoramic() -> None:
     xy = np.random.default_rng(0).uniform(0, [WIDTH, HEIGHT], (200, 2)).astype(np.float32)
-    images = [ImageKeypoints(i, xy, np.arange(200)) for i in range(2)]
+    images = [ImageKeypoints(xy, np.arange(200)) for i in range(2)]
     matches = np.repeat(np.arange(200, dtype=np.uint32)[:, None], 2, axis=1)
     (geometry,) = verify_pairs(images, np.array([[0, 1]]), [matches], KNOWN)
     assert geometry.config == TwoViewConfig.PLANAR_OR_PANORAMIC
@@ -269,7 +269,7 @@ def test_still_camera_is_panoramic() -> None:
 @pytest.mark.parametrize("camera", [KNOWN, UNKNOWN], ids=["calibrated", "uncalibrated"])
 def test_points_on_a_line_are_planar(camera: pycolmap.Camera) -> None:
     line = np.linspace([10, 20], [300, 200], 200).astype(np.float32)
-    images = [ImageKeypoints(i, line + 3 * i, np.arange(200)) for i in range(2)]
+    images = [ImageKeypoints(line + 3 * i, np.arange(200)) for i in range(2)]
     matches = np.repeat(np.arange(200, dtype=np.uint32)[:, None], 2, axis=1)
     (geometry,) = verify_pairs(images, np.array([[0, 1]]), [matches], camera)
     assert geometry.config == TwoViewConfig.PLANAR_OR_PANORAMIC
@@ -285,9 +285,7 @@ def test_configurations_agree_with_colmap_on_real_images() -> None:
     sift = cv2.SIFT_create(4000)
     features = [sift.detectAndCompute(image, None) for image in images]
     keypoints = [
-        ImageKeypoints(
-            i, np.array([p.pt for p in points], np.float32) + 0.5, np.arange(len(points))
-        )
+        ImageKeypoints(np.array([p.pt for p in points], np.float32) + 0.5, np.arange(len(points)))
         for i, (points, _) in enumerate(features)
     ]
     pairs = np.array(list(combinations(range(len(images)), 2)), dtype=np.int32)

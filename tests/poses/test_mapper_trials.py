@@ -47,7 +47,7 @@ def with_moving_object(scene: MatchedImages, request: pytest.FixtureRequest) -> 
         turn = Rotation.from_euler("y", angle, degrees=True).as_matrix()
         xy = CAMERA.img_from_cam(points @ turn.T + [0, 0, depth]) + rng.normal(0, 0.3, (count, 2))
         track = first_track + np.arange(count)
-        seen.append(ImageKeypoints(image, xy.astype(np.float32), track))
+        seen.append(ImageKeypoints(xy.astype(np.float32), track))
         own = keypoints[image]
         keypoints[image] = replace(
             own,

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from colmap_av1.errors import VideoError
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.choosing import existing_images
 from colmap_av1.images.preparing import PreparedImages, prepare_images, write_prepared
-from colmap_av1.matching.matched_images import pair_images, verify_images
+from colmap_av1.matching.matched_images import pair_by_tracks, verify_images
+from colmap_av1.matching.pairs import schedule_pairs
 from colmap_av1.options import CameraOptions, DensityOptions, MatchOptions, PairOptions
 from colmap_av1.tracks.selection import select_tracks
-from colmap_av1.tracks.tracks import least_length
 from colmap_av1.tracks.video_tracks import open_source
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Progress, no_progress
@@ -151,7 +151,7 @@ def choose_footage(
             num_frames=prepared.tracked.tracks.num_frames,
             size=prepared.shown.size,
             pixel_aspect=prepared.shown.pixel_aspect,
-            forward_motion=_is_forward_motion(prepared, video.path, options),
+            forward_motion=_is_forward_motion(prepared, options),
             warnings=prepared.tracked.video.warnings,
         )
 
@@ -197,22 +197,14 @@ def frame_list(footage: Footage, path: Path) -> str:
     return str(path)
 
 
-def _is_forward_motion(prepared: PreparedImages, video: Path, options: MatchOptions) -> bool:
+def _is_forward_motion(prepared: PreparedImages, options: MatchOptions) -> bool:
     """Whether the camera moves along its optical axis."""
     tracks, chosen = prepared.tracked.tracks, prepared.tracked.chosen
-    seen = tracks.keep_frames(chosen.frames)
+    observed = tracks.keep_frames(chosen.frames)
     camera = make_camera(options.camera, *prepared.shown.size, prepared.shown.pixel_aspect)
     context = RunContext.of(options.run)
-    try:
-        paired = pair_images(
-            str(video),
-            select_tracks(seen, DensityOptions(preset="sparse")),
-            chosen,
-            PairOptions(offsets=(1,), growth=1.0),
-            min_length=least_length(options.tracks),
-            context=context,
-        )
-    except VideoError:  # No two images share tracks, but other front-ends may still match them.
-        return False
+    tracks = select_tracks(observed, DensityOptions(preset="sparse"))
+    choose = partial(schedule_pairs, options=PairOptions(offsets=(1,), growth=1.0))
+    paired = pair_by_tracks(tracks, chosen.frames, choose)
     cameras = [camera] * len(paired.keypoints)
     return verify_images(paired, cameras, options.verify, context).forward_motion

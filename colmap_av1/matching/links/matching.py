@@ -176,8 +176,7 @@ def match_pairs(
     """
     nothing = np.empty((0, 2), np.float32)
     xy = [features[i].xy if i in features else nothing for i in range(len(cameras))]
-    # Verification uses neither frames nor tracks.
-    views = [ImageKeypoints(0, own, np.arange(len(own), dtype=np.int64)) for own in xy]
+    views = [ImageKeypoints(own, np.arange(len(own), dtype=np.int64)) for own in xy]
     there = [i in features and j in features for i, j in pairs.tolist()]
     pairs = pairs[np.array(there, dtype=np.bool_)]
 

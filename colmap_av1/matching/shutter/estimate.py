@@ -153,9 +153,7 @@ def _focal_length(
     for view in views:
         for xy in view.corrected(read_out):
             number = np.arange(len(xy), dtype=np.int64)
-            keypoints.append(
-                ImageKeypoints(len(keypoints), (xy + centre).astype(np.float32), number)
-            )
+            keypoints.append(ImageKeypoints((xy + centre).astype(np.float32), number))
     pairs = np.arange(len(keypoints), dtype=np.int32).reshape(-1, 2)
     matches = [pair_matches(keypoints[i], keypoints[j]) for i, j in pairs]
     return estimate_focal_length(keypoints, pairs, matches, size, seed=seed)
