@@ -366,12 +366,12 @@ def _read_inputs(
 ) -> Inputs:
     """Read the videos, and the photos under the names of a model from `match` or `reconstruct`.
 
-    `reconstruct` gives photos flat names.
+    `reconstruct` gives photos names that trainers accept.
     """
     inputs = read_inputs(video, photos, options.match)
     if any(photo.name in names for photo in inputs.photos):
         return inputs
-    return read_inputs(video, photos, options.match, flat=True) if inputs.photos else inputs
+    return read_inputs(video, photos, options.match, for_trainers=True) if inputs.photos else inputs
 
 
 def _size(camera: pycolmap.Camera) -> tuple[int, int]:

@@ -385,6 +385,7 @@ def _check_images_of_other_runs(
                     own.tracked.tracks.num_frames,
                     options.reading,
                     own.shown.display,
+                    use="images are compared with the video",
                     wanted=frames_near([frame]),
                 )
                 check_content([path], [frame], pictures)
@@ -704,6 +705,7 @@ def _correct_rolling_shutter(
         prepared.source.pictures.frame_rate,
         options.camera,
         context,
+        pixel_aspect=prepared.shown.pixel_aspect,
     )
     video = replace(
         tracked.video,
@@ -791,10 +793,14 @@ def _listed_cameras(
     """The cameras of a database that lists the images."""
     image_set = images.image_set
     of_images = listed_cameras(database, listed, image_set.images.names)
-    notes: dict[str, None] = {}
-    for video, shown in enumerate(images.shown):
-        camera = of_images[image_set.images_of(video).start]
-        notes |= dict.fromkeys(
-            check_pixel_aspect(camera, shown.pixel_aspect, "import the images with one of these")
-        )
+    notes = images.inputs.with_names(
+        [
+            check_pixel_aspect(
+                of_images[image_set.images_of(video).start],
+                shown.pixel_aspect,
+                "import the images with one of these",
+            )
+            for video, shown in enumerate(images.shown)
+        ]
+    )
     return ImageCameras(of_images, None, tuple(notes))

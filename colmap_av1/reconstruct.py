@@ -225,7 +225,7 @@ def reconstruct(
     output = Path(output)
     check_apart(output, [*paths_of(video), photos, *options.match.files])
     check_outside(output, photos)
-    inputs = read_inputs(video, photos, options.match, flat=True)
+    inputs = read_inputs(video, photos, options.match, for_trainers=True)
     # Invalid input is refused before the long work.
     checked = [*(own.path for own in inputs.videos), *options.match.files]
     check_gaussians_path(gaussians, checked, overwrite=overwrite)

@@ -341,7 +341,11 @@ def _view(namespace: argparse.Namespace) -> None:
     from colmap_av1.view.pictures import check_picture, write_picture
     from colmap_av1.view.video import view_video
 
-    if namespace.model is not None and namespace.interactive:
+    if namespace.pair is not None and namespace.database is None:
+        raise OptionError("pair names images of a database: give --database, too")
+    if namespace.interactive and namespace.model is None:
+        raise OptionError("interactive shows a model: give --model, too")
+    if namespace.interactive:
         _serve(namespace)
         return
     if namespace.output is None:

@@ -63,7 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             words = sys.argv[1:] if arguments is None else arguments
             namespace = _parse([underscored(word) for word in words])
             command = COMMANDS[namespace.command]
-            _import_libraries(with_pycolmap=command.pycolmap)
+            estimates = getattr(namespace, "rolling_shutter", "none") == "estimate"
+            _import_libraries(with_pycolmap=command.pycolmap or estimates)
             with failure_as_json(namespace), videos_at_hand(namespace):
                 status = command.run(namespace)
     except ColmapAv1Error as error:

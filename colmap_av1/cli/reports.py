@@ -222,7 +222,7 @@ def _link_rows(links: LinkReport) -> Rows:
     gaps = f", gaps at frames {shown}{more}" if frames else ""
     pairs = (
         f"{links.num_links} pairs from {links.num_images} images, "
-        f"{links.num_revisits} loop closures"
+        f"{links.num_loop_closures} loop closures"
     )
     between = f", {links.num_between} between videos or photos" if links.num_between else ""
     return [("SIFT links", f"{pairs}{between}{gaps}")]

@@ -87,12 +87,11 @@ def fit_path(path: Floats, positions: Floats, up: Up, seed: int) -> PathFit | st
     if rough is None:
         return "the camera does not move"
     post = _POST / rough
-    pycolmap.set_random_seed(seed)
     # pycolmap returns a dictionary, although its stub declares Sim3d.
     found: Any = pycolmap.estimate_sim3d_robust(
         np.concatenate([path, path + post * up.direction]),
         np.concatenate([positions, positions + _POST * _UP]),
-        pycolmap.RANSACOptions(max_error=_MAX_ERROR, max_num_trials=_NUM_TRIALS),
+        pycolmap.RANSACOptions(max_error=_MAX_ERROR, max_num_trials=_NUM_TRIALS, random_seed=seed),
     )
     if found is None:
         return "the camera path has a different shape"

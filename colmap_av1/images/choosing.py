@@ -436,8 +436,8 @@ def _at_steps(names: Sequence[str], num_frames: int, options: ImageOptions) -> N
                 f"'{name}' would be frame {number * step} of the video, which has frames 0 to "
                 f"{num_frames - 1}: give another every or first_number"
             )
-    twice = next((k for k, n in enumerate(numbers) if n in numbers[:k]), None)
-    if twice is not None:
+    if len(set(numbers)) < len(numbers):
+        twice = next(k for k, n in enumerate(numbers) if n in numbers[:k])
         raise ImageError(
             f"'{names[numbers.index(numbers[twice])]}' and '{names[twice]}' have the same number: "
             "list their frames in a --frame_list"

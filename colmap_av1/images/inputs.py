@@ -143,7 +143,7 @@ def read_inputs(
     photos: _Path | None,
     options: MatchOptions,
     *,
-    flat: bool = False,
+    for_trainers: bool = False,
 ) -> Inputs:
     """Open the videos and read the metadata of the photos of a run.
 
@@ -151,7 +151,7 @@ def read_inputs(
         video: a video, or several.
         photos: folder of photos; None: no photos.
         options: options of the run, checked against the number of videos and photos.
-        flat: give photos names that trainers accept, see `read_photos`.
+        for_trainers: give photos names that trainers accept, see `read_photos`.
 
     Raises:
         VideoError: a video cannot be read, is given twice, or shows all directions.
@@ -176,7 +176,11 @@ def read_inputs(
     if folder is not None:
         places.append(os.path.abspath(folder))
     labels = labels_of(places)
-    found = read_photos(folder, files, labels[-1], flat=flat) if folder is not None else []
+    found = (
+        read_photos(folder, files, labels[-1], for_trainers=for_trainers)
+        if folder is not None
+        else []
+    )
     _check_one_camera(videos, found, options.camera)
     of_videos = tuple(labels[: len(videos)]) if len(videos) > 1 else ("",)
     _check_lengths(videos, of_videos)

@@ -88,14 +88,16 @@ def _raise_unreadable(error: OSError) -> None:
     ) from error
 
 
-def read_photos(folder: Path, files: Sequence[Path], label: str, *, flat: bool) -> list[Photo]:
+def read_photos(
+    folder: Path, files: Sequence[Path], label: str, *, for_trainers: bool
+) -> list[Photo]:
     """Read the sizes and EXIF data of photos.
 
     Args:
         folder: the folder of the photos.
         files: their paths in it.
         label: their folder in the folder of all images.
-        flat: give them names for trainers, with one dot and an extension that can be written.
+        for_trainers: name them for trainers, with one dot and an extension that can be written.
 
     Raises:
         ImageError: a photo is damaged, or two would have the same name.
@@ -104,10 +106,12 @@ def read_photos(folder: Path, files: Sequence[Path], label: str, *, flat: bool) 
     names: dict[str, Path] = {}
     for file in files:
         path = folder / file
-        name = str(PurePosixPath(label, _flat(file) if flat else file.as_posix()))
+        name = str(
+            PurePosixPath(label, _name_for_trainers(file) if for_trainers else file.as_posix())
+        )
         check_name(name)
         # Masks for trainers are PNG files with the name of the image.
-        key = str(PurePosixPath(name).with_suffix("")) if flat else name
+        key = str(PurePosixPath(name).with_suffix("")) if for_trainers else name
         if key in names:
             raise ImageError(
                 f"{path} and {folder / names[key]} would both be image '{key}': rename one"
@@ -148,7 +152,7 @@ def _is_cut_short(path: Path) -> bool:
     return marker is None or data.find(_END_OF_IMAGE, marker.end()) < 0
 
 
-def _flat(file: Path) -> str:
+def _name_for_trainers(file: Path) -> str:
     """A photo's path in a form that trainers accept."""
     suffix = file.suffix.lower()
     plain = [plain_name(part) for part in file.with_suffix("").parts]

@@ -57,6 +57,8 @@ def frames_by_content(
     """
     images = np.array([_thumbnail(read_image(path)) for path in files])
     frames = np.array([_thumbnail(picture) for _, picture in pictures])
+    if len(frames) == 0:
+        raise ImageError("no picture of the video can be decoded: give an undamaged copy")
     try:
         return list(range(len(files))), _assigned(files, images, frames)
     except ImageError:

@@ -72,11 +72,12 @@ def new_cameras(
     """
     of_images: dict[int, pycolmap.Camera] = {}
     estimated: list[float | None] = []
-    notes: dict[str, None] = {}
+    notes: list[str] = []
     for shared in _sequences_by_camera(len(shown), photos, options):
-        given, aspect = options, 1.0
+        given, aspect, name = options, 1.0, ""
         if shared[0] < len(shown):
             first = shown[shared[0]]
+            name = f"{first.video}: " if len(shown) > 1 else ""
             size, aspect = first.size, first.pixel_aspect
             of_videos = [i for t in shared if t < len(shown) for i in image_set.images_of(t)]
             own = _some_images(paired, of_videos)
@@ -87,15 +88,14 @@ def new_cameras(
                 focal_length, words = _initial_focal_length(
                     focal_length, stated, given.camera_model
                 )
-                notes |= dict.fromkeys(words)
+                notes += [f"{name}{note}" for note in words]
         else:
             photo = photos[shared[0] - len(shown)]
             size, focal_length = photo.size, photo.focal_length
             given = replace(given, camera_params=None)
         camera = make_camera(given, *size, aspect, focal_length)
-        notes |= dict.fromkeys(
-            check_pixel_aspect(camera, aspect, "leave out --camera_model or give one")
-        )
+        words = check_pixel_aspect(camera, aspect, "leave out --camera_model or give one")
+        notes += [f"{name}{note}" for note in words]
         for image in (image for sequence in shared for image in image_set.images_of(sequence)):
             of_images[image] = copy.copy(camera) if given.single_camera is False else camera
     in_order = [of_images[image] for image in range(len(image_set.sequence))]

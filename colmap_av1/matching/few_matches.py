@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.names import natural_order
 from colmap_av1.matching.gaps import Gap
-from colmap_av1.matching.matched_images import MatchedImages, used_pairs
+from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.util.arrays import Floats, Ints
 from colmap_av1.util.grouping import sums_beside_gaps
 
@@ -108,18 +108,17 @@ def few_matches_warning(gaps: Sequence[Gap]) -> str | None:
     return (
         f"few matches, down to {least:.0%} of the usual number, between {shown}{others}, where the "
         "camera jerks or frames are missing: COLMAP's mappers may bend the model there by one per "
-        "cent of its extent without any other sign; run reconstruct instead, which uses the "
+        "cent of its extent without another warning; run reconstruct instead, which uses the "
         "pictures, or film more slowly"
     )
 
 
 def matching_warning(matched: MatchedImages, image_set: ImageSet) -> str | None:
     """Warn of gaps with few matches between images of a video."""
-    used, counts = used_pairs(matched)
     names = image_set.images.names
     gaps = few_match_gaps(
-        matched.pairs[used],
-        counts[used],
+        matched.pairs[matched.is_used],
+        matched.num_inliers[matched.is_used],
         names,
         image_set.sequence.tolist(),
         order=range(len(names)),

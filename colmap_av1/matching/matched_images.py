@@ -66,6 +66,12 @@ class MatchedImages(PairedImages):
         """Number of inlier matches of each pair, int64 [num_pairs]."""
         return np.array([len(own.inlier_matches) for own in self.geometries], np.int64)
 
+    @property
+    def is_used(self) -> Bools:
+        """Whether mappers use each pair, bool [num_pairs]."""
+        configs = [geometry.config for geometry in self.geometries]
+        return (self.num_inliers >= MIN_INLIERS) & ~np.isin(configs, UNUSED_CONFIGS)
+
 
 def pair_by_tracks(
     tracks: Tracks,
@@ -186,14 +192,6 @@ def _translation(geometry: TwoViewGeometry, camera: pycolmap.Camera) -> Floats |
     return np.asarray(direction / np.linalg.norm(direction))
 
 
-def used_pairs(matched: MatchedImages) -> tuple[Bools, Ints]:
-    """Return which pairs mappers use, bool [m], and the inliers of each pair, int64 [m]."""
-    counts = matched.num_inliers
-    configs = [geometry.config for geometry in matched.geometries]
-    return (counts >= MIN_INLIERS) & ~np.isin(configs, UNUSED_CONFIGS), counts
-
-
 def connected_images(matched: MatchedImages) -> NDArray[np.int32]:
     """Label each image with its connected component, int32 [num_images]."""
-    used, _ = used_pairs(matched)
-    return connected_components(len(matched.keypoints), matched.pairs[used])
+    return connected_components(len(matched.keypoints), matched.pairs[matched.is_used])

@@ -142,7 +142,7 @@ def pair_matches(a: ImageKeypoints, b: ImageKeypoints) -> NDArray[np.uint32]:
     Returns:
         uint32 [n, 2] keypoint indices (in a, in b), ascending in both columns.
     """
-    index, is_shared = _indices_in(b, a)
+    index, is_shared = _same_tracks(a, b)
     in_a = np.flatnonzero(is_shared)
     return np.column_stack([in_a, index[in_a]]).astype(np.uint32)
 
@@ -209,10 +209,10 @@ def schedule_pairs(
 
 
 def _count_shared(a: ImageKeypoints, b: ImageKeypoints) -> int:
-    return int(np.count_nonzero(_indices_in(b, a)[1]))
+    return int(np.count_nonzero(_same_tracks(a, b)[1]))
 
 
-def _indices_in(other: ImageKeypoints, own: ImageKeypoints) -> tuple[Ints, Bools]:
+def _same_tracks(own: ImageKeypoints, other: ImageKeypoints) -> tuple[Ints, Bools]:
     """Where another image observes the tracks of an image.
 
     Returns:

@@ -137,6 +137,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
             shown.frame_rate,
             options.camera,
             run.context,
+            pixel_aspect=shown.display.pixel_aspect,
         )
         fast = fast_frames(tracked.ends)
         tracks = corrected.tracks

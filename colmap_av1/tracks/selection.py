@@ -125,7 +125,7 @@ def _spread(tracks: Tracks, variance: NDArray[np.float32], limits: _Limits) -> B
 
 
 def _variance_since_first(tracks: Tracks) -> NDArray[np.float32]:
-    """Variance of each observation relative to the first kept one of its track, in px^2."""
+    """Variance of each observation relative to the first one of its track, in px^2."""
     variance = tracks.sigma * tracks.sigma
     variance -= np.repeat(variance[tracks.offsets[:-1]], tracks.lengths)
     np.maximum(variance, 0, out=variance)
@@ -133,7 +133,7 @@ def _variance_since_first(tracks: Tracks) -> NDArray[np.float32]:
 
 
 def _distance_since_first(tracks: Tracks) -> NDArray[np.float32]:
-    """Distance of each observation to the first kept one of its track, in px."""
+    """Distance of each observation to the first one of its track, in px."""
     squared = np.zeros(len(tracks.xy), dtype=np.float32)
     for along in (tracks.xy[:, 0], tracks.xy[:, 1]):
         step = np.repeat(along[tracks.offsets[:-1]], tracks.lengths)

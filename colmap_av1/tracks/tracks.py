@@ -387,8 +387,6 @@ def build_tracks(
     motion: Iterable[FrameMotion],
     options: TrackOptions = TrackOptions(),
     progress: Progress = no_progress,
-    *,
-    frames: NDArray[np.int32] | None = None,
 ) -> Tracks:
     """Chain the motion of a video into point tracks.
 
@@ -410,14 +408,11 @@ def build_tracks(
         options: how to chain.
         progress: called after each coded frame with the stage "tracks" and the number of frames so
             far.
-        frames: int32 [n] display indices of the frames whose observations are kept, which limits
-            memory; None: all frames.
 
     Returns:
         Tracks of at least `options.min_length` shown frames, 4 if None, in the order of their
         seeds (display order of the frame, then raster order). If frames differ in size, positions
-        are in pixels of the first shown frame. With `frames`, the same tracks without those that
-        are observed in fewer than two of these frames.
+        are in pixels of the first shown frame.
 
     Raises:
         VideoError: no frame is shown.
@@ -432,7 +427,7 @@ def build_tracks(
         >>> print(tracks.lengths.min(), tracks.lengths.max())
         10 60
     """
-    return build_tracks_and_ends(motion, options, progress, frames=frames)[0]
+    return build_tracks_and_ends(motion, options, progress)[0]
 
 
 def build_tracks_and_ends(
@@ -440,7 +435,7 @@ def build_tracks_and_ends(
     options: TrackOptions,
     progress: Progress,
     *,
-    frames: NDArray[np.int32] | None,
+    frames: NDArray[np.int32] | None = None,
     tracks_per_sample: int = 0,
 ) -> tuple[Tracks, Tracks]:
     """Chain the motion of a video into point tracks, and sample their ends in all frames.
@@ -449,11 +444,13 @@ def build_tracks_and_ends(
         motion: see `build_tracks`, as the next three.
         options: how to chain.
         progress: called after each coded frame.
-        frames: int32 [n] display indices of the frames whose observations are stored; None: all.
+        frames: int32 [n] display indices of the frames whose observations are kept, which limits
+            memory; None: all.
         tracks_per_sample: the ends of one in this many tracks are returned; 0: of none.
 
     Returns:
-        The tracks, see `build_tracks`. The first and the last observation of some tracks in all
+        The tracks, see `build_tracks`; with `frames`, without those that are observed in fewer than
+        two of these frames. The first and the last observation of some tracks in all
         frames, including tracks that are not observed in two of the frames: one observation per
         track if both are the same.
 

@@ -36,6 +36,8 @@ from colmap_av1.video.facts import Video, read_video
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import FileState
 
+# What pictures are decoded for, in warnings.
+_REFINED = "tracks are refined"
 # Overlay tracks are reported if they are at least this share of all tracks.
 _NOTABLE_SHARE = 0.01
 # Approximate number of tracks in each frame whose ends are sampled if observations are kept in some
@@ -261,6 +263,7 @@ def track_video(
                 tracks_per_sample=0 if coded is None else one_in,
             )
             first = first[: count_with_repeats(first, tracks.num_frames)]
+            structure.num_shown = len(first)
             tracks, ends = tracks.with_repeats(first, stored), ends.with_repeats(first)
             if stored is not None:  # the first showing of a frame may not be among the frames
                 tracks = tracks.keep_frames(stored[stored < tracks.num_frames])
@@ -273,7 +276,9 @@ def track_video(
             with clock.measure("refinement"):
                 pictures = clock.iterate(
                     "decoding",
-                    decodable_frames(source.pictures, tracks.num_frames, options.read),
+                    decodable_frames(
+                        source.pictures, tracks.num_frames, options.read, use=_REFINED
+                    ),
                 )
                 tracks = refine_tracks(
                     tracks,
@@ -398,6 +403,7 @@ def refine_in_images(
             num_frames,
             options,
             display,
+            use=_REFINED,
             wanted=wanted,
             kept=source.kept,
         )
@@ -417,8 +423,8 @@ def decodable_frames(
     options: ReadOptions,
     display: Display | None = None,
     *,
+    use: str,
     wanted: Collection[int] | None = None,
-    use: str = "tracks are refined",
     kept: KeptPictures | None = None,
 ) -> Iterator[tuple[int, Picture]]:
     """Decode the pictures of the frames that have tracks, and stop with a warning at damage.
@@ -428,8 +434,8 @@ def decodable_frames(
         num_frames: number of frames that have tracks.
         options: how the video is decoded.
         display: how pictures are cropped and rotated; None: as players do.
-        wanted: indices of the frames to yield; None: all.
         use: what the pictures are used for; the warning contains it.
+        wanted: indices of the frames to yield; None: all.
         kept: store of decoded pictures; what it holds is not decoded again.
 
     Raises:

@@ -173,7 +173,7 @@ def run_reconstruct(video: Path, output: Path, every: int | None) -> dict[str, A
     """Reconstruct, like the command."""
     options = ReconstructOptions(match=MatchOptions(images=ImageOptions(every=every)))
     report = reconstruct(video, output, options=options)
-    return {"images": report.num_images, "revisits": report.links.num_revisits}
+    return {"images": report.num_images, "revisits": report.links.num_loop_closures}
 
 
 def measure(clip: str, way: str, video: Path, scene: Any, folder: Path) -> dict[str, Value]:

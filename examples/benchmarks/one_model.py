@@ -135,7 +135,7 @@ def measure(case: str, cache: Path, console: Console) -> Row:
         registered=" and ".join(str(model.num_reg_images()) for model in models),
         centres_off=None if None in off else max(value for value in off if value is not None),
         **long_range(outputs[0], APART.get(case, ruler.FAR)),
-        revisits=report.links.num_revisits,
+        revisits=report.links.num_loop_closures,
         between=report.links.num_between,
         links_cpu_s=report.cpu_seconds.get("links", 0.0),
         cpu_s=run.cpu_seconds,

@@ -174,8 +174,8 @@ def test_image_names_must_be_utf_8(tmp_path: Path) -> None:
     write_image(tmp_path / f"{name}.png", np.zeros((8, 8, 3), dtype=np.uint8))
     files, _ = photo_files(tmp_path)
     with pytest.raises(ImageError, match="not UTF-8"):
-        read_photos(tmp_path, files, "photos", flat=False)
-    (photo,) = read_photos(tmp_path, files, "photos", flat=True)
+        read_photos(tmp_path, files, "photos", for_trainers=False)
+    (photo,) = read_photos(tmp_path, files, "photos", for_trainers=True)
     assert photo.name == "photos/_.png"
 
 
@@ -184,9 +184,9 @@ def test_photos_whose_masks_would_have_one_name_are_refused(tmp_path: Path) -> N
     files = [Path("a.jpg"), Path("a.png")]
     for file in files:
         write_image(tmp_path / file, np.zeros((8, 8, 3), dtype=np.uint8))
-    assert len(read_photos(tmp_path, files, "photos", flat=False)) == 2
+    assert len(read_photos(tmp_path, files, "photos", for_trainers=False)) == 2
     with pytest.raises(ImageError, match="rename"):
-        read_photos(tmp_path, files, "photos", flat=True)
+        read_photos(tmp_path, files, "photos", for_trainers=True)
 
 
 def test_only_photos_that_are_cut_short_are_refused(tmp_path: Path) -> None:
@@ -202,12 +202,12 @@ def test_only_photos_that_are_cut_short_are_refused(tmp_path: Path) -> None:
     }
     for name, content in photos.items():
         (tmp_path / name).write_bytes(content)
-        assert len(read_photos(tmp_path, [Path(name)], "photos", flat=False)) == 1
+        assert len(read_photos(tmp_path, [Path(name)], "photos", for_trainers=False)) == 1
         end = content.index(data[2:]) + len(data) - 2
         for length in (end - 2, end - len(data) // 2):
             (tmp_path / name).write_bytes(content[:length])
             with pytest.raises(ImageError, match=f"{name}: is damaged"):
-                read_photos(tmp_path, [Path(name)], "photos", flat=False)
+                read_photos(tmp_path, [Path(name)], "photos", for_trainers=False)
 
 
 @pytest.mark.parametrize("ending", ["png", "tiff"])
@@ -216,10 +216,10 @@ def test_truncated_photos_without_loss_are_refused(tmp_path: Path, ending: str) 
     data = cv2.imencode(f".{ending}", picture)[1].tobytes()
     photo = Path(f"a.{ending}")
     (tmp_path / photo).write_bytes(data)
-    assert len(read_photos(tmp_path, [photo], "photos", flat=False)) == 1
+    assert len(read_photos(tmp_path, [photo], "photos", for_trainers=False)) == 1
     (tmp_path / photo).write_bytes(data[: len(data) // 2])
     with pytest.raises(ImageError):
-        read_photos(tmp_path, [photo], "photos", flat=False)
+        read_photos(tmp_path, [photo], "photos", for_trainers=False)
 
 
 def test_hidden_photos_are_not_mentioned(tmp_path: Path) -> None:

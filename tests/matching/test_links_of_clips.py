@@ -40,7 +40,7 @@ def test_overlay_text_causes_no_loop_closures(shared: Path, encode: Encode, tmp_
     report = match(tmp_path / "a.db", display, options=FEWER_FEATURES)
     assert report.links.frames_of_gaps() == [(11, 12), (28, 29)]
     assert report.links.num_links > 20
-    assert report.links.num_revisits < 25
+    assert report.links.num_loop_closures < 25
 
 
 def test_calm_video_needs_no_decoded_pictures(shared: Path, tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_cut_to_a_known_place_is_linked_with_few_features(
     assert report.links.frames_of_gaps() == [(18, 19), (42, 43)]
     assert report.links.frames_of_gaps("contradicted") == [(18, 19), (42, 43)]
     assert report.links.frames_of_gaps("no overlap") == []
-    assert report.links.num_revisits >= 2
+    assert report.links.num_loop_closures >= 2
     assert check_database(tmp_path / "a.db").num_connected_images == 57
 
 

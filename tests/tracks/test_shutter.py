@@ -140,7 +140,9 @@ def test_rolling_shutter_option() -> None:
     tracks = tracks_of(0.45)
     for wanted, found in (("none", None), ("15", 15.0), ("-7.5", -7.5)):
         options = MatchOptions(camera=CameraOptions(rolling_shutter=wanted))
-        corrected = correct_rolling_shutter(tracks, Display(), RATE, options.camera, RunContext())
+        corrected = correct_rolling_shutter(
+            tracks, Display(), RATE, options.camera, RunContext(), pixel_aspect=1.0
+        )
         assert corrected.read_out == pytest.approx(found)
         assert (corrected.tracks is tracks) == (found is None)
         assert not corrected.warnings
@@ -151,11 +153,15 @@ def test_rolling_shutter_option() -> None:
             camera_params=f"{FOCAL},{WIDTH / 2},{HEIGHT / 2}",
         )
     )
-    corrected = correct_rolling_shutter(tracks, Display(), RATE, options.camera, RunContext())
+    corrected = correct_rolling_shutter(
+        tracks, Display(), RATE, options.camera, RunContext(), pixel_aspect=1.0
+    )
     assert corrected.read_out == pytest.approx(15, abs=1.5)
     fisheye = CameraOptions(rolling_shutter="estimate", camera_model="OPENCV_FISHEYE")
     for rate, camera, word in ((None, options.camera, "rate"), (RATE, fisheye, "fisheye")):
-        unknown = correct_rolling_shutter(tracks, Display(), rate, camera, RunContext())
+        unknown = correct_rolling_shutter(
+            tracks, Display(), rate, camera, RunContext(), pixel_aspect=1.0
+        )
         assert unknown.tracks is tracks
         assert unknown.read_out is None
         assert word in unknown.warnings[0]

@@ -973,7 +973,7 @@ def test_observations_in_selected_frames_are_a_subset(
     frames = np.arange(1, len(motion) + 3, every, dtype=np.int32)
     tracks = build_tracks(motion, options)
     seen = tracks.keep_frames(frames[frames < tracks.num_frames]).keep_long(2)
-    some = build_tracks(motion, options, frames=frames)
+    some, _ = build_tracks_and_ends(motion, options, no_progress, frames=frames)
     assert some.num_frames == tracks.num_frames
     for name in ("offsets", "frame", "xy", "sigma", "confirmed"):
         assert getattr(some, name).tobytes() == getattr(seen, name).tobytes()

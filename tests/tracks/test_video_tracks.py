@@ -207,18 +207,18 @@ def hurt(clip: Path, ffmpeg: Ffmpeg, tmp_path: Path) -> Path:
 
 def test_decoding_stops_at_the_damage(hurt: Path) -> None:
     with pytest.warns(UserWarning, match=r"cut\.ivf"):
-        count = len(list(decodable_frames(read_video(hurt), 16, OPTIONS.reading)))
+        count = len(list(decodable_frames(read_video(hurt), 16, OPTIONS.reading, use="tested")))
     assert 4 < count < 16
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # the requested frames are intact
-        whole = list(decodable_frames(read_video(hurt), count, OPTIONS.reading))
+        whole = list(decodable_frames(read_video(hurt), count, OPTIONS.reading, use="tested"))
     assert [index for index, _ in whole] == list(range(count))
     with pytest.raises(BitstreamError, match=r"cut\.ivf"):
-        list(decodable_frames(read_video(hurt), 16, STRICT.reading))
+        list(decodable_frames(read_video(hurt), 16, STRICT.reading, use="tested"))
 
 
 def test_decodable_frames_are_the_first_frames(clip: Path) -> None:
-    asked = list(decodable_frames(read_video(clip), 3, OPTIONS.reading))
+    asked = list(decodable_frames(read_video(clip), 3, OPTIONS.reading, use="tested"))
     assert [index for index, _ in asked] == [0, 1, 2]
     for (_, picture), (_, whole) in zip(asked, decode_frames(clip), strict=False):
         np.testing.assert_array_equal(picture, whole)

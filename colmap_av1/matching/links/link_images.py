@@ -236,7 +236,7 @@ def _link(
     merged = merge_links(matched, links, features, [*contradicted, *linked])
     report = LinkReport(
         num_links=len(links.pairs),
-        num_revisits=len(loops & found),
+        num_loop_closures=len(loops & found),
         num_between=len(between & found),
         gaps=gaps_after_linking(plan.gaps, contradicted, merged, image_set),
         fast=tuple(

@@ -20,7 +20,7 @@ class LinkReport:
         num_images: images whose pictures were examined.
         searched_loops: whether loop closures were searched in all videos.
         num_links: pairs that were linked.
-        num_revisits: linked pairs that close a loop.
+        num_loop_closures: linked pairs that close a loop.
         num_between: linked pairs of different videos or photos.
         gaps: gaps that motion does not bridge, in order.
         fast: first and last frame of each stretch in which the camera moves fast and all pictures
@@ -34,7 +34,7 @@ class LinkReport:
     num_images: int = 0
     searched_loops: bool = False
     num_links: int = 0
-    num_revisits: int = 0
+    num_loop_closures: int = 0
     num_between: int = 0
     gaps: tuple[Gap, ...] = ()
     fast: tuple[tuple[int, int], ...] = ()

@@ -35,6 +35,8 @@ def correct_rolling_shutter(
     rate: float | None,
     camera: CameraOptions,
     context: RunContext,
+    *,
+    pixel_aspect: float,
 ) -> ShutterCorrection:
     """Move tracks to their positions in the middle of each picture's read-out.
 
@@ -44,12 +46,15 @@ def correct_rolling_shutter(
         rate: frames per second; None if unknown.
         camera: the read-out time, the model and given intrinsics.
         context: its clock gets the stage "shutter".
+        pixel_aspect: width over height of the pixels that tracks are in.
     """
     if camera.rolling_shutter == "none" or tracks.num_frames == 0:
         return ShutterCorrection(tracks)
     with context.clock.measure("shutter"):
         down = rows_down(display, (tracks.width, tracks.height))
-        found = _read_out(tracks, display, rate, camera, down=down, seed=context.seed)
+        found = _read_out(
+            tracks, rate, camera, down=down, pixel_aspect=pixel_aspect, seed=context.seed
+        )
         if rate is None or isinstance(found, str):
             return ShutterCorrection(
                 tracks, warnings=(f"keypoints are not corrected for a rolling shutter: {found}",)
@@ -59,11 +64,11 @@ def correct_rolling_shutter(
 
 def _read_out(
     tracks: Tracks,
-    display: Display,
     rate: float | None,
     camera: CameraOptions,
     *,
     down: tuple[int, int],
+    pixel_aspect: float,
     seed: int,
 ) -> float | str:
     """The read-out time in frames, or why it is unknown."""
@@ -71,7 +76,7 @@ def _read_out(
         return "the video has no frame rate"
     if camera.rolling_shutter != "estimate":
         return float(camera.rolling_shutter) / 1000 * rate
-    if not is_nearly_pinhole(camera.camera_model) or not is_square(display.pixel_aspect):
+    if not is_nearly_pinhole(camera.camera_model) or not is_square(pixel_aspect):
         return (
             "the time is not estimated for fisheye lenses and pixels that are not square: give it "
             "in milliseconds"
