@@ -511,17 +511,15 @@ def _match_images(
     try:
         if cameras is not None and _has_several_cameras(images.image_set, cameras):
             raise ModelError(
-                "the database has several cameras for the images of one video: leave out --verify "
-                "joint"
+                "the database has several cameras for the images of one video, import them with "
+                "--ImageReader.single_camera 1 to avoid this: leave out --verify joint"
             )
         return _match_jointly(images, cameras, scratch, options, context)
     except (ModelError, VideoError) as error:
-        if options.verify.verify == "joint":
-            failure, see_log, _ = str(error).partition(": see ")
-            if see_log:  # the log is deleted with the other temporary files
-                raise ModelError(f"{failure}: leave out --verify joint") from error
-            raise
+        # What to do is for `reconstruct`, whose log is kept.
         reason = str(error).rpartition(": ")[0] or str(error)
+        if options.verify.verify == "joint":
+            raise type(error)(f"{reason}: leave out --verify joint") from error
     videos = [_with_selected_tracks(own, options, context) for own in images.videos]
     found = _match_pairs(replace(images, videos=videos), cameras, options, context)
     if not found.depth.is_observable:

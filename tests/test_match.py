@@ -252,6 +252,7 @@ def test_every_second_frame_becomes_an_image(clip: Path, tmp_path: Path) -> None
     ("options", "error"),
     [
         (MatchOptions(camera=CameraOptions(camera_params="9,9,9,9,0,0,0,0")), OptionError),
+        (MatchOptions(camera=CameraOptions(camera_params="900,640,360,0")), OptionError),
         (MatchOptions(images=ImageOptions(frame_list="missing.txt")), ImageError),
         (MatchOptions(pairs=PairOptions(min_matches=10**6)), VideoError),
     ],

@@ -115,6 +115,8 @@ def _import_libraries(*, with_pycolmap: bool) -> None:
             import pycolmap
 
             pycolmap.logging.logtostderr = True
+            for level in pycolmap.logging.Level.__members__.values():
+                pycolmap.logging.set_log_destination(level, "")  # no files in any case
 
 
 def _parse(words: Sequence[str]) -> argparse.Namespace:

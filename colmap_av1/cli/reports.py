@@ -179,9 +179,9 @@ def _place_rows(place: Place) -> Rows:
 
 
 def _long_range_rows(median: float | None, largest: float | None) -> Rows:
-    """Long-range epipolar error; no row if no images far apart in time overlap."""
+    """Long-range epipolar error of a model that was checked."""
     if median is None:
-        return []
+        return [("long-range epipolar error", "unknown: no images far apart in time overlap")]
     words = f"{median:.2f} px (median), {largest:.2f} px (90th percentile)"
     return [("long-range epipolar error", words)]
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import pycolmap
 
+from colmap_av1.errors import OptionError
 from colmap_av1.options import CameraOptions
 from colmap_av1.options.camera import (
     DEFAULT_MODEL,
@@ -29,6 +30,9 @@ _SHORTEST, _LONGEST = 0.3, 5.0
 # Longer focal lengths, in units of the longer image side, are rare in videos: fields of view below
 # 45 degrees. With little parallax, a mapper may converge to twice the true focal length.
 _LONG = 1.2
+# A principal point that is further off centre, as a share of the image side, is doubtful. Cropped
+# pictures may have one.
+_MOST_OFF_CENTRE = 0.2
 # Larger image sides in pixels are damaged data.
 _LONGEST_SIDE = 1 << 20
 # Encoders round the display size of scaled pictures, by a few tenths of a percent.
@@ -57,7 +61,8 @@ def make_camera(
         focal_length: estimated focal length in pixel heights; used if no parameters are given.
 
     Raises:
-        OptionError: the parameters do not fit the given or the default model.
+        OptionError: the parameters do not fit the given or the default model, or their principal
+            point lies outside the image.
     """
     name = options.camera_model
     if name is None:
@@ -75,6 +80,12 @@ def make_camera(
     camera.has_prior_focal_length = is_known
     if options.camera_params is not None:
         camera.params = parse_camera_params(options.camera_params, camera)
+        x, y = camera.principal_point_x, camera.principal_point_y
+        if not (0 < x < width and 0 < y < height):
+            raise OptionError(
+                f"camera_params has the principal point ({x:g}, {y:g}), but the images are "
+                f"{width}x{height}: give the parameters for this size"
+            )
     return camera
 
 
@@ -108,6 +119,19 @@ def focal_length_warning(cameras: Iterable[pycolmap.Camera]) -> str | None:
                 f"of {camera.width}x{camera.height}: give --camera_model and --camera_params"
             )
     return None
+
+
+def off_centre_warning(camera: pycolmap.Camera) -> str | None:
+    """Warn of a principal point far from the centre, as in parameters for another picture size."""
+    x, y = camera.principal_point_x, camera.principal_point_y
+    away = max(abs(x / camera.width - 0.5), abs(y / camera.height - 0.5))
+    if away <= _MOST_OFF_CENTRE:
+        return None
+    return (
+        f"camera_params has the principal point ({x:g}, {y:g}), far from the centre of images of "
+        f"{camera.width}x{camera.height}: check that the parameters are for this size and not for "
+        "the rotated picture"
+    )
 
 
 def has_long_focal_length(camera: pycolmap.Camera) -> bool:

@@ -97,8 +97,9 @@ def _assigned(
                     f"{' and '.join(twins)} show the same frame, {best}: keep one of them"
                 )
             raise ImageError(
-                f"{path}: shows frame {best}, but the names of the images are not in the order of "
-                "their frames: rename them, or list their frames in a --frame_list"
+                f"{path}: shows frame {best} if it is of this video, but the names of the images "
+                "are not in the order of their frames: give the video that all of them come from, "
+                "rename them, or list their frames in a --frame_list"
             )
         _check_rivals(path, int(found[k]), similarity[k], frames)
     return np.asarray(found, dtype=np.int32)

@@ -15,6 +15,7 @@ from colmap_av1.geometry.cameras import (
     is_fisheye,
     is_nearly_pinhole,
     make_camera,
+    off_centre_warning,
 )
 from colmap_av1.images.image_set import ImageSet, ShownVideo
 from colmap_av1.images.photos import Photo
@@ -95,6 +96,8 @@ def new_cameras(
             given = replace(given, camera_params=None)
         camera = make_camera(given, *size, aspect, focal_length)
         words = check_pixel_aspect(camera, aspect, "leave out --camera_model or give one")
+        off_centre = off_centre_warning(camera) if given.camera_params is not None else None
+        words += [off_centre] if off_centre is not None else []
         notes += [f"{name}{note}" for note in words]
         for image in (image for sequence in shared for image in image_set.images_of(sequence)):
             of_images[image] = copy.copy(camera) if given.single_camera is False else camera

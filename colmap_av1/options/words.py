@@ -40,6 +40,8 @@ def word_of(value: object) -> str:
         return "none"
     if isinstance(value, bool):
         return str(int(value))
+    if isinstance(value, float) and value.is_integer():
+        return str(int(value))
     if isinstance(value, tuple):
-        return ",".join(map(str, value))
+        return ",".join(map(word_of, value))
     return str(value)

@@ -16,7 +16,7 @@ from colmap_av1.errors import ImageError
 from colmap_av1.geometry.colmap_model import ModelImage, posed_images
 from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, make_mask
-from colmap_av1.images.files import read_image
+from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file, natural_order
 from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.sift import Features, extract_features, masked_features
@@ -215,10 +215,17 @@ def model_long_range_errors(
     posed = posed_images(reconstruction)
     names = list(posed)
     images = [posed[names[k]] for k in natural_order(names)]
-    if not any(image_file(image_path, name).is_file() for name in names):
+    of_cameras = {
+        image.camera_id: file
+        for image in images
+        if (file := image_file(image_path, image.name)).is_file()
+    }
+    if not of_cameras:
         raise ImageError(
             f"{image_path}: has none of the model's images: give the folder of the model's images"
         )
+    for camera_id, file in of_cameras.items():
+        _check_size(file, image_size(file), reconstruction.cameras[camera_id])
 
     def points_of(index: int) -> Floats:
         seen = reconstruction.images[images[index].image_id].points2D
@@ -229,18 +236,24 @@ def model_long_range_errors(
     check = LongRangeCheck(images, dict(reconstruction.cameras), points_of)
     for done, index in enumerate(check.wanted, start=1):
         image = images[index]
-        picture = read_image(image_file(image_path, image.name))
-        camera = reconstruction.cameras[image.camera_id]
-        size, wanted = picture.shape[1::-1], (camera.width, camera.height)
-        if size != wanted:
-            raise ImageError(
-                f"{image_file(image_path, image.name)}: is {size[0]}x{size[1]}, but its camera in "
-                f"the model {wanted[0]}x{wanted[1]}: give the folder of the model's images"
-            )
+        file = image_file(image_path, image.name)
+        picture = read_image(file)
+        height, width = picture.shape[:2]
+        size = (width, height)
+        _check_size(file, size, reconstruction.cameras[image.camera_id])
         seen = reconstruction.images[image.image_id].points2D
         check.add(index, picture, _near_points([p.xy for p in seen if p.has_point3D()], size))
         progress("long range", done, len(check.wanted))
     return check.result()
+
+
+def _check_size(file: Path, size: tuple[int, int], camera: pycolmap.Camera) -> None:
+    """Raise `ImageError` if an image has another size than its camera."""
+    if size != (camera.width, camera.height):
+        raise ImageError(
+            f"{file}: is {size[0]}x{size[1]}, but its camera in the model "
+            f"{camera.width}x{camera.height}: give the folder of the model's images"
+        )
 
 
 def _near_points(positions: Sequence[Floats], size: tuple[int, int]) -> Mask | None:

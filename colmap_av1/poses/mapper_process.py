@@ -35,7 +35,11 @@ def run_child(settings: dict[str, Any]) -> None:
     import numpy as np  # noqa: F401, PLC0415 - before pycolmap
     import pycolmap  # noqa: PLC0415
 
-    pycolmap.logging.logtostderr = True  # instead of to files in the temporary folder
+    # Log to standard error, and not to files in the temporary folder. pycolmap's adjustment resets
+    # the first setting.
+    pycolmap.logging.logtostderr = True
+    for level in pycolmap.logging.Level.__members__.values():
+        pycolmap.logging.set_log_destination(level, "")
     pycolmap.set_random_seed(settings["seed"])
     try:
         if settings["task"] == "adjustment":

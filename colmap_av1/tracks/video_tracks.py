@@ -31,7 +31,7 @@ from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.coded_size import coded_size, with_downscale
 from colmap_av1.video.decoding import decode_frames
 from colmap_av1.video.display import Display
-from colmap_av1.video.encode import EncodeReport, encode, stream_of
+from colmap_av1.video.encode import EncodeReport, encode_for_motion, stream_of
 from colmap_av1.video.facts import Video, read_video
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import FileState
@@ -148,11 +148,10 @@ def open_source(
         return
     with _scratch(next_to) as folder:
         with context.clock.measure("encoding"):
-            made = encode(
+            made = encode_for_motion(
                 video,
                 folder / "stream.mp4",
                 strict=strict,
-                telemetry=False,  # positions are read from the original video
                 options=how,
                 progress=context.progress,
             )

@@ -56,5 +56,5 @@ def scaling(options: EncodeOptions) -> list[str]:
     if factor == 1:
         return []
     # `iw` and `ih` are the size of the picture after ffmpeg has rotated and cropped it.
-    width, height = (f"max(2\\,2*floor({side}/{factor!r}/2+0.5))" for side in ("iw", "ih"))
+    width, height = (f"max(2\\,2*floor({side}/{factor:.15g}/2+0.5))" for side in ("iw", "ih"))
     return [f"scale=w={width}:h={height}:flags=area"]

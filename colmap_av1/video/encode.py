@@ -15,6 +15,8 @@ from pathlib import Path
 
 import av
 import av.error
+import numpy as np
+from numpy.typing import NDArray
 
 from colmap_av1.errors import (
     BitstreamError,
@@ -80,14 +82,13 @@ def encode(
     *,
     overwrite: bool = False,
     strict: bool = False,
-    telemetry: bool = True,
     options: EncodeOptions = EncodeOptions(),
     progress: Progress = no_progress,
 ) -> EncodeReport:
     """Convert a video to AV1 with backward references only and a single intra frame.
 
-    Every frame of the video becomes one frame of the stream, none is dropped or duplicated, and
-    time stamps are kept. Interlaced pictures are deinterlaced, which keeps their first field.
+    Every frame that players show becomes one frame of the stream, none is dropped or duplicated,
+    and time stamps are kept. Interlaced pictures are deinterlaced, which keeps their first field.
     Pictures are rotated as players rotate them, and downscaled if the options ask for it. Sound is
     dropped. GPS positions and the direction of gravity are copied if the output format can hold
     them; otherwise a warning is given. The output appears under its name only when it is complete.
@@ -98,7 +99,6 @@ def encode(
         output: the stream; its extension .mp4, .mkv, .webm or .ivf selects the container.
         overwrite: replace an existing output.
         strict: raise an error for a damaged video.
-        telemetry: copy GPS positions and the direction of gravity.
         options: the encoder and its settings.
         progress: called with the stage "encoding", the number of frames done, and the total if
             it is known.
@@ -122,10 +122,32 @@ def encode(
         output,
         overwrite=overwrite,
         strict=strict,
-        telemetry=telemetry,
         options=options,
         progress=progress,
-        is_kept=False,
+    )
+
+
+def encode_for_motion(
+    video: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    strict: bool,
+    options: EncodeOptions,
+    progress: Progress,
+) -> EncodeReport:
+    """Convert a video as `encode` does, to a stream that only its motion is read from.
+
+    It also has the frames that an edit list hides, because motion runs through them, and no
+    positions, which are read from the video itself.
+    """
+    return _encode(
+        video,
+        output,
+        overwrite=False,
+        strict=strict,
+        options=options,
+        progress=progress,
+        is_for_motion=True,
     )
 
 
@@ -135,12 +157,23 @@ def _encode(
     *,
     overwrite: bool,
     strict: bool,
-    telemetry: bool,
     options: EncodeOptions,
     progress: Progress,
-    is_kept: bool,
+    is_for_motion: bool = False,
+    is_kept: bool = False,
 ) -> EncodeReport:
-    """Do the work of `encode`; `is_kept` marks the output as a kept stream of the video."""
+    """Do the work of `encode`, `encode_for_motion` and `stream_of`.
+
+    Args:
+        video: see `encode`, as the next five.
+        output: the stream.
+        overwrite: replace an existing output.
+        strict: raise an error for a damaged video.
+        options: the encoder and its settings.
+        progress: called with the stage "encoding".
+        is_for_motion: see `encode_for_motion`.
+        is_kept: mark the output as a kept stream of the video.
+    """
     path, output = Path(video), Path(output)
     if output.suffix.lower() not in _FORMATS:
         raise OptionError(f"{output}: give an output that ends in {', '.join(_FORMATS)}")
@@ -158,14 +191,20 @@ def _encode(
             f"{output}: IVF cannot hold the pixel aspect of {path}, without which focal lengths "
             "are wrong: give an output that ends in .mp4, .mkv or .webm"
         )
-    positions = read_positions(file) if telemetry else None
-    second_input, copied = carrying(file, positions, output_format) if telemetry else ([], [])
+    ignores_edits = "mov" in file.container and (
+        is_for_motion or file.doubtful_times is not None  # an edit list that hides nearly all
+    )
+    positions, second_input, copied = None, list[str](), list[str]()
+    if not is_for_motion:
+        positions = read_positions(file)
+        second_input, copied = carrying(file, positions, output_format, ignores_edits=ignores_edits)
+    presented = None if ignores_edits else file.presented
+    expected = file.num_packets if presented is None else len(presented)
     name, ffmpeg = find_encoder(options)
     encoder = ENCODERS[name]
     quality, speed = settings(encoder, options)
     before = [ffmpeg, *TALK, "-nostdin", "-y", *encoder.before_input]
-    if "mov" in file.container:
-        # Frames that an edit list hides are converted too, because motion runs through them.
+    if ignores_edits:
         before += ["-ignore_editlist", "1"]
     # fmt: off
     arguments = [
@@ -192,7 +231,7 @@ def _encode(
         mark["readable"] = file.num_packets
 
     def convert(partial: Path, num_frames: int | None = None) -> int:
-        total = num_frames or file.num_packets
+        total = num_frames or expected
         progress("encoding", 0, total)
         command = [*before, *arguments]
         if num_frames is not None:
@@ -209,7 +248,7 @@ def _encode(
 
     with writing(output), whole_file(target) as partial, unchanged(file.state):
         count = convert(partial)
-        readable = _readable_frames(file, count, damage, strict=strict)
+        readable = _readable_frames(file, count, damage, presented, strict=strict)
         if readable < count:
             count = convert(partial, readable)
     loss = loss_of(file, positions, output)
@@ -279,9 +318,9 @@ def stream_of(
         output,
         overwrite=True,
         strict=strict,
-        telemetry=False,
         options=options,
         progress=progress,
+        is_for_motion=True,
         is_kept=True,
     )
 
@@ -358,7 +397,14 @@ def _process(command: Sequence[str], log_file: object) -> Iterator[subprocess.Po
                 process.stdout.close()
 
 
-def _readable_frames(video: VideoFile, count: int, damage: str | None, *, strict: bool) -> int:
+def _readable_frames(
+    video: VideoFile,
+    count: int,
+    damage: str | None,
+    presented: NDArray[np.int32] | None,
+    *,
+    strict: bool,
+) -> int:
     """Number of the `count` frames written by ffmpeg that PyAV decodes, too.
 
     ffmpeg continues after damage, and the frames that it skips shift all later ones.
@@ -367,11 +413,14 @@ def _readable_frames(video: VideoFile, count: int, damage: str | None, *, strict
         video: the video.
         count: number of frames that ffmpeg wrote.
         damage: how the file is cut off, see `counted`.
+        presented: the frames that were converted, see `Video.presented`; None: all.
         strict: whether damage is an error.
     """
     readable = count
-    if count != video.num_packets:
+    if count != (video.num_packets if presented is None else len(presented)):
         readable, damage = count_decodable(video)
+        if presented is not None:
+            readable = int((presented < readable).sum())
     if damage is None and readable == count:
         return count
     if damage is None or readable > count:

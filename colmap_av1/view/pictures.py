@@ -45,7 +45,9 @@ def check_picture(
     """
     path = Path(output)
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise OptionError(f"{path}: give an output that ends in .png or .jpg")
+        raise OptionError(
+            f"{path}: give an output that ends in .png or .jpg, or in .html for a model"
+        )
     check_new_file(path, inputs, overwrite=overwrite)
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import pycolmap
 import pytest
 
+from colmap_av1.errors import OptionError
 from colmap_av1.geometry.cameras import (
     focal_length_warning,
     has_long_focal_length,
     make_camera,
+    off_centre_warning,
     with_initial_intrinsics,
 )
 from colmap_av1.options import CameraOptions
@@ -46,3 +48,13 @@ def test_initial_intrinsics_are_those_of_a_new_camera(model: str) -> None:
     refined.params = params.tolist()
     assert with_initial_intrinsics(refined).params.tolist() == pytest.approx(new.params.tolist())
     assert refined.mean_focal_length() == 900.0
+
+
+def test_principal_point_of_another_picture_size_is_doubtful() -> None:
+    def warning(params: str, width: int, height: int) -> str | None:
+        return off_centre_warning(make_camera(CameraOptions("PINHOLE", params), width, height))
+
+    assert warning("255,255,180,320", 360, 640) is None
+    assert warning("255,255,320,180", 360, 640) is not None
+    with pytest.raises(OptionError):
+        warning("510,510,360,640", 360, 640)

@@ -157,6 +157,14 @@ def test_up_is_estimated_from_the_camera_orientation(seed: int) -> None:
     assert np.linalg.det(rotation_to_up(up)) == pytest.approx(1)
 
 
+def test_up_is_estimated_although_some_pictures_are_stored_sideways() -> None:
+    world = elsewhere()
+    poses = transform_poses(world, walk())
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    poses[::4] = quarter @ poses[::4]
+    assert angle(up_of_cameras(poses), world.rotation * Z) < 4
+
+
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
 def test_up_by_gravity_works_in_any_sensor_axes(order: tuple[int, ...]) -> None:
     world = elsewhere()

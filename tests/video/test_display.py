@@ -255,6 +255,13 @@ def test_edit_list_of_a_clip_with_b_frames_is_applied(
     for name, image in zip(sorted((tmp_path / "images").iterdir()), expected, strict=True):
         np.testing.assert_array_equal(cv2.imread(str(name)), image)
     check_motion(tmp_path / "a.db")
+    encoded = convert(trimmed, tmp_path / "av1.mp4")
+    assert encoded.num_frames == len(expected)
+    with av.open(str(encoded.output)) as container:
+        times = [
+            float(packet.pts * packet.time_base) for packet in container.demux() if packet.size
+        ]
+    np.testing.assert_allclose(times, np.arange(len(expected)) / 25, atol=1e-3)
 
 
 def check_motion(database: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.util.arrays import Floats
+from colmap_av1.util.arrays import Bools, Floats
 from colmap_av1.util.spread import evenly_spread
 
 _Item = TypeVar("_Item")
@@ -19,6 +19,10 @@ _Item = TypeVar("_Item")
 # Weight of the mean up direction of the images compared with the requirement that their x axes are
 # horizontal. It is small, because cameras are pitched more than they are rolled.
 _PITCH_WEIGHT = 0.005
+# A picture is stored sideways if its up direction is this far from the usual one, unless that is
+# true of more than this share of the pictures: those of a camera that looks down point anywhere.
+_TURNED = np.deg2rad(60)
+_MOST_TURNED = 0.3
 # Sine of the largest angle between a vertical line and the approximate up direction, and the
 # smallest number of lines.
 _LARGEST_LEAN = np.sin(np.deg2rad(20))
@@ -36,11 +40,15 @@ _LARGEST_SCATTER = 10.0
 
 
 def up_of_cameras(cam_from_world: Floats) -> Floats:
-    """Up direction (unit vector) of cameras [n, 3, 4] that are rolled little.
+    """Up direction (unit vector) of cameras [n, 3, 4] most of which are rolled little.
 
     It is perpendicular to the x axes of the cameras. If these are parallel, it is the perpendicular
-    direction that is closest to the mean -y axis.
+    direction that is closest to the mean -y axis. A minority of pictures may be stored sideways or
+    upside down, as photos of phones often are.
     """
+    is_turned = _is_turned(cam_from_world)
+    if is_turned.mean() <= _MOST_TURNED:
+        cam_from_world = cam_from_world[~is_turned]
     across, down = cam_from_world[:, 0, :3], cam_from_world[:, 1, :3]
     mean = -down.mean(axis=0)
     mean /= max(float(np.linalg.norm(mean)), 1e-12)
@@ -48,6 +56,17 @@ def up_of_cameras(cam_from_world: Floats) -> Floats:
     pitched = _PITCH_WEIGHT * (np.eye(3) - np.outer(mean, mean))
     found = np.linalg.eigh(rolled + pitched)[1][:, 0]
     return np.asarray(found if found @ mean >= 0 else -found)
+
+
+def _is_turned(cam_from_world: Floats) -> Bools:
+    """Which cameras' -y axes are far from the usual one."""
+    up = -cam_from_world[:, 1, :3]
+    usual = up.mean(axis=0)
+    for _ in range(_ITERATIONS):  # Weiszfeld's iteration for the geometric median
+        distance = np.maximum(np.linalg.norm(up - usual, axis=1), 1e-6)
+        usual = (up / distance[:, None]).sum(axis=0) / (1 / distance).sum()
+    usual /= max(float(np.linalg.norm(usual)), 1e-12)
+    return np.asarray(up @ usual < np.cos(_TURNED))
 
 
 def up_of_gravity(cam_from_world: Floats, gravity: Floats) -> tuple[Floats, float] | None:

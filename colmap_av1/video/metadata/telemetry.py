@@ -19,14 +19,15 @@ _SAME_TIME = 0.01
 
 
 def carrying(
-    video: VideoFile, found: Positions | None, output_format: str
+    video: VideoFile, found: Positions | None, output_format: str, *, ignores_edits: bool
 ) -> tuple[list[str], list[str]]:
     """FFmpeg's arguments that copy positions and gravity from a video.
 
     Args:
-        video: the video, which is ffmpeg's first input, with its edit list ignored.
+        video: the video, which is ffmpeg's first input.
         found: its positions and gravity.
         output_format: ffmpeg's name of the output format.
+        ignores_edits: whether the edit list of the first input is ignored.
 
     Returns:
         Arguments for a second input, and for the output; empty if the format cannot hold them.
@@ -45,9 +46,10 @@ def carrying(
         how = ["-c:d", "copy", "-copy_unknown"]
     else:
         return [], words
-    # The stream begins with the frames that the edit list hides, so telemetry, which follows the
-    # edit list, must be shifted.
-    again = ["-itsoffset", f"{-found.first_picture:.6f}", "-i", f"file:{video}"]
+    again = ["-i", f"file:{video}"]
+    if ignores_edits or "mov" not in video.container:
+        # The stream begins with the first coded frame, whenever it is shown.
+        again = ["-itsoffset", f"{-found.first_picture:.6f}", *again]
     return again, [*words, "-map", f"1:{found.stream}", *how]
 
 
