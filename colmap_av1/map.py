@@ -22,7 +22,6 @@ from colmap_av1.geometry.posed_model import posed_model
 from colmap_av1.geometry.uncertainty import MAX_CERTAIN_ERROR, expected_error, uncertainty_warning
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file
-from colmap_av1.matching.few_matches import few_matches_warning
 from colmap_av1.options import MapOptions, PlaceOptions
 from colmap_av1.options.place import parse_distance
 from colmap_av1.poses.long_range import LongRangeErrors
@@ -154,8 +153,7 @@ def map_database(
         _missing(database, posed_images(model), num_registered),
         checked.depth.warning,
         focal_length_warning(posed_model(model).cameras.values()),
-        # Seams of the model are more specific than gaps of the matches.
-        *(found.seam_warnings or (few_matches_warning(checked.few_match_gaps),)),
+        *found.seam_warnings,
         found.long_range.warning() if found.long_range else unreadable,
         uncertainty_warning(found.expected_error),
         *_uncertain_models(output, len(num_registered)),
