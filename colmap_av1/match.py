@@ -287,7 +287,7 @@ def match(
         is_undetermined = cameras is None and joint is not None and is_assumed
         is_known_ahead = start.limits == FORWARD_MOTION and not is_assumed
         names = images.image_set.images.names
-        started = _start_mapper(
+        started = _choose_mapper_start(
             start,
             names,
             found,
@@ -320,8 +320,8 @@ def match(
     kinds = Counter(geometry.config.name for geometry in written.geometries)
     num_inliers = written.num_inliers
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
-    notes += (*positions.warnings, *found.warnings)
-    doubts = [started.warning, found.depth.warning, focal_length_warning(found.cameras)]
+    notes += (*positions.warnings, *found.warnings, *started.warnings)
+    doubts = [found.depth.warning, focal_length_warning(found.cameras)]
     # Few matches do not mean a gap if existing matches of the database may connect the images, or
     # with a joint estimate, which omits matches that only repeat tracks of other pairs.
     if options.on_existing != "append" and joint is None:
@@ -536,16 +536,16 @@ class _MapperStart:
         matched: the images with their matches.
         cameras: the camera of each image.
         fixed_intrinsics: see `MatchReport`.
-        warning: a problem with the mapper or the cameras; None if there is none.
+        warnings: problems with the mapper or the cameras.
     """
 
     matched: MatchedImages
     cameras: Sequence[pycolmap.Camera]
     fixed_intrinsics: bool
-    warning: str | None = None
+    warnings: tuple[str, ...] = ()
 
 
-def _start_mapper(
+def _choose_mapper_start(
     start: PreparedStart,
     names: Sequence[str],
     found: ImageMatches,
@@ -570,30 +570,30 @@ def _start_mapper(
     cameras, known = found.cameras, with_known_focal_lengths(found.cameras)
     # Without depth, there is no good start.
     is_tried = start.is_tried or not found.depth.is_observable
-    matched = warning = None
+    warnings = []
     if is_undetermined:
-        if not is_tried:
-            with suppress(ModelError):
-                matched = demote_failing_starts(start, names, cameras, clock, is_assumed=True)
+        with suppress(ModelError):
+            matched = demote_failing_starts(start, names, cameras, clock, is_assumed=True)
             if matched is not None:
                 return _MapperStart(matched, cameras, fixed_intrinsics=False)
-            warning = (
-                "the images hardly determine the focal length, so the mapper keeps a default that "
-                "may be far off: give the intrinsics by --camera_params if you know them"
-            )
+        warnings.append(
+            "the images hardly determine the focal length, so the mapper keeps a default that may "
+            "be far off: give the intrinsics by --camera_params if you know them"
+        )
         # The mapper keeps the default intrinsics only if they count as known.
         cameras, fixed_intrinsics = known, True
+    matched = None
     try:
         if not is_tried:
             matched = demote_failing_starts(
                 start, names, known, clock, fixed_intrinsics=fixed_intrinsics
             )
     except ModelError:
-        warning = (
+        warnings.append(
             "COLMAP's mapper failed in a trial on this database, and may fail again: if so, its "
             "output tells why"
         )
-    return _MapperStart(matched or start.matched, cameras, fixed_intrinsics, warning)
+    return _MapperStart(matched or start.matched, cameras, fixed_intrinsics, tuple(warnings))
 
 
 def _has_assumed_focal_length(found: ImageMatches) -> bool:

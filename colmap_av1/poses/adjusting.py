@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 import tempfile
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,12 +12,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from colmap_av1.geometry.cameras import as_radial
 from colmap_av1.geometry.colmap_model import posed_images, read_model, write_model
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.options import ReconstructOptions
-from colmap_av1.options.camera import DEFAULT_MODEL
 from colmap_av1.poses.mapper import ADJUSTMENT_STEPS, ADJUSTMENT_TOLERANCE, adjust_model
 from colmap_av1.poses.run import Run
 from colmap_av1.util.arrays import Bools, Floats, Ints
@@ -48,16 +45,7 @@ FOCAL_LENGTH_ERROR = 0.1
 # An image must observe this many points to stay registered, as COLMAP's mapper requires, or this
 # share of the median if that is less. An image filled by a pillar observed 8 where others observed
 # 300 or more, and its pose error was 300 times theirs.
-_FEW_SEEN = (30, 0.1)
-# A camera gets a second distortion parameter if at least this many images share it and the
-# parameter lowers the mean robust cost below this share. On clips of distorting lenses the share is
-# 0.967 to 0.997; on rendered ones without distortion, and on drives, which determine neither the
-# focal length nor the distortion, it is 0.999 to 1.
-_SECOND_DISTORTION = (8, 0.998)
-# The focal length changes by up to a fifth then, and converges slowly.
-_DISTORTION_STEPS, _DISTORTION_TOLERANCE = 50, 1e-5
-# A larger parameter has diverged: COLMAP's mapper filters the images of such a camera.
-_MAX_DISTORTION = 1.0
+_LEAST_OBSERVED, _LEAST_OBSERVED_SHARE = 30, 0.1
 # Step of the phase in which consecutive points keep observations: the fractional part of the golden
 # ratio. Points that are observed in the same images then keep different ones.
 _PHASE_STEP = (5**0.5 - 1) / 2
@@ -147,61 +135,11 @@ def adjust_posed(
     return Adjusted(replace(adjusted, points=points), left[enough])
 
 
-def without_unseen_images(model: PosedModel) -> Adjusted:
+def without_sparse_images(model: PosedModel) -> Adjusted:
     """Drop the images that observe too few points, and points that are left with fewer than two."""
     counts = np.bincount(model.points.image, minlength=len(model.images))
-    most, share = _FEW_SEEN
-    is_seen = counts >= min(most, share * float(np.median(counts)))
-    return Adjusted(*model.some(is_seen))
-
-
-def with_second_distortion(run: Run, model: PosedModel) -> PosedModel:
-    """Make cameras of the default model RADIAL if the images show that they need it.
-
-    A mapper that does not know the focal length begins with one distortion parameter, because a
-    pair of images rarely determines two. With many lenses, one parameter biases the focal length
-    and bends the path.
-
-    Args:
-        run: the run.
-        model: a model of the mapper, with points.
-
-    Returns:
-        The adjusted model; the given one if no camera needs a second parameter.
-    """
-    fewest_images, cost_share = _SECOND_DISTORTION
-    num_images = Counter(image.camera_id for image in model.images)
-    numbers = {
-        number
-        for number, camera in model.cameras.items()
-        if camera.model_name == DEFAULT_MODEL and num_images[number] >= fewest_images
-    }
-    options = run.options
-    is_given = run.cameras is not None or options.match.camera.camera_model is not None
-    is_adjusted = options.mapping.adjust and refines_intrinsics(options)
-    if is_given or not is_adjusted or not numbers:
-        return model
-
-    def adjusted(own: PosedModel) -> PosedModel:
-        return adjust_posed(
-            run,
-            own,
-            loss_scales=LOSS_SCALES[-1:],
-            max_steps=_DISTORTION_STEPS,
-            tolerance=_DISTORTION_TOLERANCE,
-        ).model
-
-    simple = adjusted(model)
-    cameras = {i: as_radial(own) if i in numbers else own for i, own in simple.cameras.items()}
-    radial = adjusted(replace(simple, cameras=cameras))
-    distortion = [
-        abs(radial.cameras[i].params[j])
-        for i in numbers
-        for j in radial.cameras[i].extra_params_idxs()
-    ]
-    simple_cost, radial_cost = (mean_cost(reprojection_errors(own)) for own in (simple, radial))
-    is_better = radial_cost < cost_share * simple_cost
-    return radial if is_better and max(distortion) <= _MAX_DISTORTION else model
+    least = min(_LEAST_OBSERVED, _LEAST_OBSERVED_SHARE * float(np.median(counts)))
+    return Adjusted(*model.some(counts >= least))
 
 
 def mean_cost(errors: Floats) -> float:

@@ -18,7 +18,7 @@ from colmap_av1.poses.adjusting import (
     adjust_posed,
     focal_length_errors,
     refines_intrinsics,
-    without_unseen_images,
+    without_sparse_images,
 )
 from colmap_av1.poses.corners.in_images import corners_in_images
 from colmap_av1.poses.dynamic.following import follow_behind, has_changing_masks
@@ -153,7 +153,7 @@ def adjustment_stage(
             if is_assumed and refine and not is_long:
                 adjusted = _converged(run, adjusted, iterative=iterative)
             run.progress("adjustment", 1, 1)
-            trimmed = without_unseen_images(adjusted.model)
+            trimmed = without_sparse_images(adjusted.model)
         names = image_set.images.names
         photos = names[image_set.photos.start :]
         seams = model_seams(trimmed.model, photos, names)

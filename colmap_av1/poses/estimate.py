@@ -60,14 +60,14 @@ class _FirstEstimate:
 
     Attributes:
         links: where links are looked for.
-        may_be_right: whether no pictures contradict the poses, or a split may mend them.
+        can_be_kept: whether no pictures contradict the poses, or a split may correct them.
     """
 
     links: _FurtherLinks
-    may_be_right: bool
+    can_be_kept: bool
 
 
-_NO_LINKS = _FurtherLinks()
+_NOTHING_FURTHER = _FurtherLinks()
 
 
 class _Last(Generic[_Value]):
@@ -187,7 +187,7 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
 
 def _first_estimate(estimates: _Estimates) -> _FirstEstimate:
     """Make the first estimate, and see where further links are needed."""
-    run, posed = estimates.run, estimates.whole(_NO_LINKS, None)
+    run, posed = estimates.run, estimates.whole(_NOTHING_FURTHER, None)
     links = _FurtherLinks(
         doubted=tuple(_unlinked_seams(run, estimates.image_set, posed)),
         loops=_needs_loops(run, posed),
@@ -200,17 +200,17 @@ def _further_links(estimates: _Estimates, first: _FirstEstimate) -> _FurtherLink
 
     Links may follow an object that moves.
     """
-    if first.links == _NO_LINKS:
-        return _NO_LINKS
+    if first.links == _NOTHING_FURTHER:
+        return _NOTHING_FURTHER
     try:
         linked = estimates.outcome(first.links)
     except ModelError:  # the poses without them can be used
-        return _NO_LINKS
-    if not first.may_be_right or not linked.is_contradicted:
+        return _NOTHING_FURTHER
+    if not first.can_be_kept or not linked.is_contradicted:
         return first.links
-    plain = estimates.outcome(_NO_LINKS)
+    plain = estimates.outcome(_NOTHING_FURTHER)
     is_large = plain.num_registered >= _LEAST_SHARE * linked.num_registered
-    return _NO_LINKS if is_large and not plain.is_contradicted else first.links
+    return _NOTHING_FURTHER if is_large and not plain.is_contradicted else first.links
 
 
 def _used_links(estimates: _Estimates, further: _FurtherLinks) -> _FurtherLinks:

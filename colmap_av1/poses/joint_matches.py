@@ -57,8 +57,8 @@ _LEAST_ERROR, _MEDIAN_ERRORS = 0.6, 4.0
 _POINTS = TriangulateOptions(
     max_reprojection_error=1.0, min_angle=POINT_MIN_ANGLE, max_depth_error=0.5, points="survey"
 )
-# Pairs at these distances in images are matched.
-_NEAR = (1, 2, 3, 4, 5, *SPANS[2:])
+# Pairs at these distances in images are matched: at all spans of tracks and at half of them.
+_NEAR = sorted({*SPANS, *(span // 2 for span in SPANS)})
 _MAX_PAIRS = 16
 # Number of pictures whose SIFT features are counted, and COLMAP's threshold for them. With OpenCV's
 # own threshold, which is twice as high, pictures of low contrast have far fewer features.
@@ -69,7 +69,7 @@ _SAME_POINT = 1.0
 # Two tracks of one video this close to each other, in pixels, are the same.
 _SAME_TRACK = 0.01
 # If at least this share of the images is not registered, the estimate has failed.
-_MAX_LEFT = 0.5
+_MAX_NOT_REGISTERED = 0.5
 # Largest number of matches of the initial pair.
 _MAX_INITIAL_MATCHES = 300
 
@@ -153,7 +153,7 @@ def match_jointly(
     not_registered = [name for name in image_set.images.names if name not in in_models]
     num_images = len(image_set.sequence)
     # Images of uncertain models count, because without the estimate their models would be bent.
-    if len(lost.union(in_models)) <= (1 - _MAX_LEFT) * num_images:
+    if len(lost.union(in_models)) <= (1 - _MAX_NOT_REGISTERED) * num_images:
         raise ModelError(
             f"the joint estimate registers only {len(in_models)} of {num_images} images: match "
             "them pair by pair with --verify pairs"

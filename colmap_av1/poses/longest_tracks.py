@@ -20,7 +20,7 @@ from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.graphs import connected_components
 
 # Number of tracks that each image and each pair keeps.
-LONGEST_TRACKS = 200, 30
+TRACKS_OF_IMAGE, TRACKS_OF_PAIR = 200, 30
 
 
 def keep_longest_tracks(database: Path) -> None:
@@ -84,11 +84,10 @@ def _on_longest_tracks(
     in_image = np.zeros(len(num_keypoints), np.int64)
     in_pair = np.zeros(len(pairs), np.int64)
     is_kept = np.zeros(len(images_of), np.bool_)
-    of_image, of_pair = LONGEST_TRACKS
     for number in sorted(range(len(images_of)), key=lambda k: -len(images_of[k])):
         own_images, own_pairs = images_of[number], pairs_of[number]
-        few_in_image = (in_image[own_images] < of_image).any()
-        is_kept[number] = few_in_image or (in_pair[own_pairs] < of_pair).any()
+        few_in_image = (in_image[own_images] < TRACKS_OF_IMAGE).any()
+        is_kept[number] = few_in_image or (in_pair[own_pairs] < TRACKS_OF_PAIR).any()
         if is_kept[number]:
             in_image[own_images] += 1
             in_pair[own_pairs] += 1

@@ -20,12 +20,13 @@ from colmap_av1.geometry.posed_model import (
 )
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import CameraOptions, MapOptions
-from colmap_av1.poses.adjusting import refines_intrinsics, with_second_distortion
+from colmap_av1.poses.adjusting import refines_intrinsics
 from colmap_av1.poses.longest_tracks import keep_longest_tracks
 from colmap_av1.poses.mapper import MapperEffort, map_poses
 from colmap_av1.poses.match_stage import MatchesResult
 from colmap_av1.poses.posed_images import PosesResult
 from colmap_av1.poses.run import Run
+from colmap_av1.poses.second_distortion import with_second_distortion
 from colmap_av1.poses.track_stage import LEAST_IMAGES
 from colmap_av1.util.digests import digest_of
 from colmap_av1.util.stages import Kept, run_stage
@@ -98,7 +99,8 @@ def mapping_stage(
         if not found:
             camera = options.match.camera
             raise ModelError(_why_no_model(found_before, attempt.mapper, camera))
-        found = [with_second_distortion(run, model) for model in found]
+        with clock.measure("adjustment"):
+            found = [with_second_distortion(run, model) for model in found]
         # Further images belong to the model of their nearest key image.
         found.sort(key=lambda model: -num_nearest(model, image_set, keyed))
         (partial / "poses").mkdir()

@@ -151,7 +151,8 @@ def _parts_stage(
 
     def make(partial: Path) -> MappedResult:
         known = read_poses(run, adjusted)
-        parts = parts_of_model(known)
+        with run.clock.measure("adjustment"):
+            parts = parts_of_model(known)
         (partial / name).mkdir()
         files = [f"{name}/{part}.npz" for part in range(len(parts))]
         for file, names in zip(files, parts, strict=True):

@@ -133,7 +133,7 @@ def remap_stage(
             num_registered=len(poses.images),
             mapper="global",
             other_models=(*files[1:], *mapped.result.other_models),
-            share=len(poses.images) / len(known.images),
+            share=len(found.images) / len(known.images) if found is not None else 0.0,
             kept=kept,
             cost=cost,
             new_cost=new_cost,

@@ -25,8 +25,8 @@ from colmap_av1.poses.adjusting import (
     adjust_posed,
     focal_length_errors,
     used_observations,
-    with_second_distortion,
 )
+from colmap_av1.poses.second_distortion import with_second_distortion
 from colmap_av1.reconstruct import ReconstructReport
 from colmap_av1.util.run_context import RunContext
 

@@ -16,7 +16,7 @@ from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.options import MapOptions
-from colmap_av1.poses.longest_tracks import LONGEST_TRACKS, keep_longest_tracks
+from colmap_av1.poses.longest_tracks import TRACKS_OF_IMAGE, TRACKS_OF_PAIR, keep_longest_tracks
 from colmap_av1.poses.mapper import map_poses
 from colmap_av1.reconstruct import ReconstructReport
 from colmap_av1.util.progress import no_progress
@@ -50,14 +50,13 @@ def test_images_and_pairs_keep_their_number_of_tracks(
     database = shutil.copyfile(made.database, tmp_path / "few.db")
     keep_longest_tracks(database)
     before, after = inliers_of(made.database), inliers_of(database)
-    of_image, of_pair = LONGEST_TRACKS
     assert before.keys() == after.keys()
     for pair, matches in after.items():
-        assert len(matches) >= min(of_pair, len(before[pair]))
+        assert len(matches) >= min(TRACKS_OF_PAIR, len(before[pair]))
         assert {*map(tuple, matches.tolist())} <= {*map(tuple, before[pair].tolist())}
     counts = num_matched(after)
     for image_id, count in num_matched(before).items():
-        assert counts[image_id] >= min(of_image, count)
+        assert counts[image_id] >= min(TRACKS_OF_IMAGE, count)
     assert sum(map(len, after.values())) < sum(map(len, before.values()))
 
 
@@ -86,8 +85,7 @@ def test_poses_are_as_accurate_as_with_all_tracks(
 
 def test_short_tracks_across_a_gap_are_kept(tmp_path: Path) -> None:
     """The tracks on either side are longer and more than an image needs."""
-    of_image, of_pair = LONGEST_TRACKS
-    num_long, num_short = 3 * of_image, of_pair - 5
+    num_long, num_short = 3 * TRACKS_OF_IMAGE, TRACKS_OF_PAIR - 5
     rng = np.random.default_rng(0)
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=[500, 320, 240])
     database = tmp_path / "a.db"
@@ -105,7 +103,7 @@ def test_short_tracks_across_a_gap_are_kept(tmp_path: Path) -> None:
     keep_longest_tracks(database)
     after = inliers_of(database)
     assert len(after[5, 6]) == num_short
-    assert all(len(matches) == of_image for pair, matches in after.items() if pair != (5, 6))
+    assert all(len(matches) == TRACKS_OF_IMAGE for pair, matches in after.items() if pair != (5, 6))
 
 
 def matching(first: int, stop: int) -> pycolmap.TwoViewGeometry:

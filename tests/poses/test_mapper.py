@@ -16,7 +16,7 @@ from colmap_av1.geometry.colmap_model import read_model, write_model
 from colmap_av1.geometry.posed_model import posed_model, read_posed_model
 from colmap_av1.options import MapOptions, Mapper
 from colmap_av1.poses import mapper as mapper_module
-from colmap_av1.poses.adjusting import without_unseen_images
+from colmap_av1.poses.adjusting import without_sparse_images
 from colmap_av1.reconstruct import ReconstructReport
 from colmap_av1.util.progress import Progress, no_progress
 
@@ -160,7 +160,7 @@ def test_images_with_few_points_are_dropped(
     seen = [index for index, p in enumerate(image.points2D) if p.has_point3D()]
     for index in seen[kept:]:
         model.delete_observation(image.image_id, index)
-    found = without_unseen_images(posed_model(model, with_points=True)).model
+    found = without_sparse_images(posed_model(model, with_points=True)).model
     names = {own.name for own in model.images.values()} - (set() if stays else {image.name})
     assert found.by_name.keys() == names
 
@@ -172,6 +172,6 @@ def test_images_of_a_model_with_few_points_are_kept(
     by_length = sorted(model.points3D, key=lambda number: -model.points3D[number].track.length())
     for number in by_length[25:]:
         model.delete_point3D(number)
-    found = without_unseen_images(posed_model(model, with_points=True)).model
+    found = without_sparse_images(posed_model(model, with_points=True)).model
     assert 0 < np.bincount(found.points.image, minlength=NUM_IMAGES).min() <= 25
     assert len(found.images) == NUM_IMAGES
