@@ -24,8 +24,8 @@ from colmap_av1.images.preparing import check_fit
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.options import MatchOptions, ReconstructOptions
 from colmap_av1.poses.estimate import estimate_poses
+from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.placing.placement import Place
-from colmap_av1.poses.posed import Posed
 from colmap_av1.poses.posed_images import read_poses
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import (
@@ -311,20 +311,20 @@ def _run_stages(run: Run) -> ReconstructReport:
     )
     positions = image_positions(image_set, run.inputs.videos, run.inputs.photos)
     run = replace(run, positions=positions)
-    posed = estimate_poses(run, videos, image_set)
-    del videos  # These tracks are as large as those in `posed`.
-    placed, written = written_model(run, posed, image_set)
-    further, not_registered = further_models(run, posed, image_set)
-    assert posed.long_range is not None
-    matches, poses, model = posed.matches.result, posed.last.result, written.result
-    registered = read_poses(run, posed.last)
+    estimate = estimate_poses(run, videos, image_set)
+    del videos  # These tracks are as large as those in `estimate`.
+    placed, written = written_model(run, estimate, image_set)
+    further, not_registered = further_models(run, estimate, image_set)
+    assert estimate.long_range is not None
+    matches, poses, model = estimate.matches.result, estimate.last.result, written.result
+    registered = read_poses(run, estimate.last)
     with run.clock.measure("adjustment"):
         centre_error = expected_error(registered)
     further_warnings = (
         focal_length_warning(registered.cameras.values()),
         uncertainty_warning(centre_error),
     )
-    long_range = posed.long_range.result
+    long_range = estimate.long_range.result
     return ReconstructReport(
         output=run.output,
         videos=tuple(source.pictures.path for source in run.sources),
@@ -334,7 +334,7 @@ def _run_stages(run: Run) -> ReconstructReport:
         num_frames=sum(stage.result.num_frames for stage in tracked),
         num_images=len(image_set.sequence),
         masked=image_set.masked,
-        dynamic_share=posed.dynamic.result.share if posed.dynamic is not None else None,
+        dynamic_share=estimate.dynamic.result.share if estimate.dynamic is not None else None,
         num_key_images=len(matches.key_images),
         num_registered=poses.num_registered,
         registered=_registered_by_video(registered.by_name, image_set),
@@ -352,13 +352,13 @@ def _run_stages(run: Run) -> ReconstructReport:
         place=placed.result.place,
         focal_lengths=model.focal_lengths,
         undistorted=model.undistorted,
-        mapper=posed.mapped.result.mapper,
+        mapper=estimate.mapped.result.mapper,
         forward_motion=matches.forward_motion,
         links=matches.links,
         gaussians=None,
         resumed=(
             *(stage_of_video(run, video) for video in numbers if tracked[video].resumed),
-            *posed.resumed,
+            *estimate.resumed,
             *(["place"] if placed.resumed else []),
             *(["model"] if written.resumed else []),
         ),
@@ -371,7 +371,7 @@ def _run_stages(run: Run) -> ReconstructReport:
             *matches.warnings,
             *placed.result.place_warnings,
             *(warning for warning in further_warnings if warning is not None),
-            *_warnings(posed, model, image_set, further, not_registered),
+            *_warnings(estimate, model, image_set, further, not_registered),
         ),
         timelines=_timelines(run, image_set, matches.key_images, not_registered),
     )
@@ -414,14 +414,14 @@ def _timelines(
 
 
 def _warnings(
-    posed: Posed,
+    estimate: Estimate,
     model: ModelResult,
     image_set: ImageSet,
     further: Sequence[FurtherModel],
     not_registered: Sequence[str],
 ) -> list[str]:
     """Warnings about the poses and the model."""
-    matches, poses = posed.matches.result, posed.last.result
+    matches, poses = estimate.matches.result, estimate.last.result
     num_images = len(image_set.sequence)
     warnings = []
     if further:
@@ -447,10 +447,10 @@ def _warnings(
         )
     if matches.depth.warning is not None:
         warnings.append(matches.depth.warning)
-    if posed.long_range is not None and posed.long_range.result.warning is not None:
-        warnings.append(posed.long_range.result.warning)
-    if posed.adjustment is not None and posed.adjustment.result.seams_warning is not None:
-        warnings.append(posed.adjustment.result.seams_warning)
+    if estimate.long_range is not None and estimate.long_range.result.warning is not None:
+        warnings.append(estimate.long_range.result.warning)
+    if estimate.adjustment is not None and estimate.adjustment.result.seams_warning is not None:
+        warnings.append(estimate.adjustment.result.seams_warning)
     if model.agreeing < LEAST_AGREEING:
         warnings.append(
             f"only {model.agreeing:.0%} of the tracks agree with the poses, which may be wrong: "

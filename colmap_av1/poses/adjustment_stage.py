@@ -90,7 +90,7 @@ def adjustment_stage(
     tracks: Tracks,
     links: Tracks,
     image_set: ImageSet,
-    posed: Kept[PosesResult],
+    poses: Kept[PosesResult],
     *,
     dynamic_masks: Mapping[str, Mask],
     masks_digest: str | None,
@@ -110,7 +110,7 @@ def adjustment_stage(
         tracks: the tracks of all sequences.
         links: links as tracks.
         image_set: the images.
-        posed: the stage with the initial poses.
+        poses: the stage with the initial poses.
         dynamic_masks: masks that exclude dynamic pixels, by image name; `tracks` and `links` have
             none of these pixels.
         masks_digest: digest of the stage that found them; None if there are none.
@@ -126,7 +126,7 @@ def adjustment_stage(
     has_gaps = bool(dynamic_masks) or has_changing_masks(image_set)
 
     def make(partial: Path) -> AdjustedResult:
-        registered = read_posed_images(run, posed, image_set)
+        registered = read_posed_images(run, poses, image_set)
         # Not kept in a variable: the long tracks need several times the memory of the selection.
         spread = select_tracks(pose_tracks(run, tracks).keep_frames(registered.frames), _ADJUSTED)
         if has_picture_positions and has_gaps:
@@ -182,7 +182,7 @@ def adjustment_stage(
         run.stages,
         f"adjustment{suffix}",
         [
-            posed.digest,
+            poses.digest,
             given,
             options.match.camera.single_camera,
             has_picture_positions,

@@ -1,8 +1,9 @@
 """The joint estimate of all poses, for `match` and `reconstruct`.
 
-Poses are first estimated without further links, see `posed`. What they show decides where links are
-looked for, whether links are used at all, and which of the mapper's models becomes the first. The
-decisions are stages: a resumed run whose decisions are stored makes only the final estimate.
+Poses are first estimated without further links, see `estimate_steps`. What they show decides where
+links are looked for, whether links are used at all, and which of the mapper's models becomes the
+first. The decisions are stages: a resumed run whose decisions are stored makes only the final
+estimate.
 """
 
 from __future__ import annotations
@@ -14,9 +15,15 @@ from typing import Any, Generic, Literal, TypeVar
 from colmap_av1.errors import ModelError, VideoError
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.image_set import ImageSet
+from colmap_av1.poses.estimate_steps import (
+    Estimate,
+    KeyImageModels,
+    map_key_images,
+    pose_images,
+    split_at_seams,
+)
 from colmap_av1.poses.mapping_stage import num_nearest
 from colmap_av1.poses.match_stage import matches_key
-from colmap_av1.poses.posed import Mapped, Posed, map_key_images, pose_images, split_at_seams
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.util.stages import run_stage
@@ -90,8 +97,8 @@ class _Outcome:
 
     Attributes:
         num_registered: number of registered images.
-        is_contradicted: see `Posed`.
-        is_confirmed: see `Posed`.
+        is_contradicted: see `Estimate`.
+        is_confirmed: see `Estimate`.
     """
 
     num_registered: int
@@ -110,40 +117,44 @@ class _Estimates:
     def __init__(self, run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> None:
         self.run, self.image_set = run, image_set
         self._videos = videos
-        self._mapped, self._whole, self._split = _Last[Mapped](), _Last[Posed](), _Last[Posed]()
+        self._mapped, self._whole, self._split = (
+            _Last[KeyImageModels](),
+            _Last[Estimate](),
+            _Last[Estimate](),
+        )
 
-    def mapped(self, links: _FurtherLinks) -> Mapped:
+    def mapped(self, links: _FurtherLinks) -> KeyImageModels:
         """The mapper's models of the key images."""
         run = self._run(links)
 
-        def make() -> Mapped:
+        def make() -> KeyImageModels:
             return map_key_images(run, self._videos, self.image_set, doubted=links.doubted)
 
         return self._mapped.get((links,), make)
 
-    def whole(self, links: _FurtherLinks, first: str | None) -> Posed:
+    def whole(self, links: _FurtherLinks, first: str | None) -> Estimate:
         """The adjusted poses of one of these models, given by its file; None: the largest."""
         run = self._run(links)
 
-        def make() -> Posed:
+        def make() -> Estimate:
             return pose_images(run, self._videos, self.image_set, self.mapped(links), first)
 
         return self._whole.get((links, first), make)
 
-    def split(self, links: _FurtherLinks, first: str | None) -> Posed:
+    def split(self, links: _FurtherLinks, first: str | None) -> Estimate:
         """These poses, split at doubtful seams."""
         run = self._run(links)
 
-        def make() -> Posed:
+        def make() -> Estimate:
             return split_at_seams(run, self.whole(links, first), self.image_set)
 
         return self._split.get((links, first), make)
 
     def outcome(self, links: _FurtherLinks, first: str | None = None) -> _Outcome:
         """What the estimate shows after it is split."""
-        posed = self.split(links, first)
-        size = posed.last.result.num_registered
-        return _Outcome(size, posed.is_contradicted, posed.is_confirmed)
+        estimate = self.split(links, first)
+        size = estimate.last.result.num_registered
+        return _Outcome(size, estimate.is_contradicted, estimate.is_confirmed)
 
     def is_split(self, links: _FurtherLinks) -> bool:
         """Whether the largest model is split."""
@@ -155,7 +166,7 @@ class _Estimates:
         return _with_links(self.run, "sift") if links.loops else self.run
 
 
-def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> Posed:
+def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> Estimate:
     """Estimate poses, and if they are doubtful estimate them again with further SIFT links.
 
     Links replace motion at doubtful seams. Loop closures are looked for if pictures far apart in
@@ -187,12 +198,12 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
 
 def _first_estimate(estimates: _Estimates) -> _FirstEstimate:
     """Make the first estimate, and see where further links are needed."""
-    run, posed = estimates.run, estimates.whole(_NOTHING_FURTHER, None)
+    run, estimate = estimates.run, estimates.whole(_NOTHING_FURTHER, None)
     links = _FurtherLinks(
-        doubted=tuple(_unlinked_seams(run, estimates.image_set, posed)),
-        loops=_needs_loops(run, posed),
+        doubted=tuple(_unlinked_seams(run, estimates.image_set, estimate)),
+        loops=_needs_loops(run, estimate),
     )
-    return _FirstEstimate(links, not posed.is_contradicted or bool(posed.seams_to_split))
+    return _FirstEstimate(links, not estimate.is_contradicted or bool(estimate.seams_to_split))
 
 
 def _further_links(estimates: _Estimates, first: _FirstEstimate) -> _FurtherLinks:
@@ -262,10 +273,10 @@ def _larger_model(estimates: _Estimates, links: _FurtherLinks, size: int) -> str
     return others[0] if is_larger else None
 
 
-def _needs_loops(run: Run, posed: Posed) -> bool:
+def _needs_loops(run: Run, estimate: Estimate) -> bool:
     """Whether pictures far apart contradict the poses, and no loop closures were looked for."""
-    looked = run.options.match.links.links != "auto" or posed.matches.result.links.searched_loops
-    return posed.is_contradicted and not looked
+    looked = run.options.match.links.links != "auto" or estimate.matches.result.links.searched_loops
+    return estimate.is_contradicted and not looked
 
 
 def _with_links(run: Run, links: Literal["sift", "none"]) -> Run:
@@ -275,16 +286,16 @@ def _with_links(run: Run, links: Literal["sift", "none"]) -> Run:
     return replace(run, options=replace(run.options, match=match))
 
 
-def _unlinked_seams(run: Run, image_set: ImageSet, posed: Posed) -> list[int]:
+def _unlinked_seams(run: Run, image_set: ImageSet, estimate: Estimate) -> list[int]:
     """Frames after doubtful seams where no links were looked for."""
-    if posed.adjustment is None or run.options.match.links.links == "none":
+    if estimate.adjustment is None or run.options.match.links.links == "none":
         return []
     frame_of = image_set.images.frame_of
-    links = posed.matches.result.links
+    links = estimate.matches.result.links
     looked_at = [*links.frames_of_gaps(), *links.fast]
     seams = [
         (frame_of[first], frame_of[second])
-        for first, second in posed.adjustment.result.doubtful_seams
+        for first, second in estimate.adjustment.result.doubtful_seams
     ]
     return [
         after

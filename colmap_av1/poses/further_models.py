@@ -10,15 +10,15 @@ from pathlib import Path
 from colmap_av1.errors import ModelError, writing
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.poses.mapping_stage import MappedResult
-from colmap_av1.poses.parts import MIN_MODEL_SIZE
-from colmap_av1.poses.posed import (
-    Posed,
+from colmap_av1.poses.estimate_steps import (
+    Estimate,
     refined_poses,
     remapped_poses,
     split_at_seams,
     trusted_tracks,
 )
+from colmap_av1.poses.mapping_stage import MappedResult
+from colmap_av1.poses.parts import MIN_MODEL_SIZE
 from colmap_av1.poses.posed_images import read_poses
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import LEAST_IMAGES
@@ -43,12 +43,12 @@ class FurtherPoses:
 
     Attributes:
         run: its run, with a separate output folder.
-        posed: its stages.
+        estimate: its stages.
         image_set: the images that no earlier model has; some of them are registered.
     """
 
     run: Run
-    posed: Posed
+    estimate: Estimate
     image_set: ImageSet
 
 
@@ -69,7 +69,7 @@ class TriedModel:
 
 def further_poses(
     run: Run,
-    first: Posed,
+    first: Estimate,
     image_set: ImageSet,
     read_tracks: Callable[[], Sequence[Tracks]],
     *,
@@ -105,7 +105,7 @@ def further_poses(
         candidates = free.difference(mapped.excluded, *(other.model.by_name for other in waiting))
         some = _named(image_set, known | candidates)
         try:
-            posed = refined_poses(
+            estimate = refined_poses(
                 own,
                 first.matches,
                 own_poses,
@@ -115,25 +115,25 @@ def further_poses(
                 has_picture_positions=first.has_picture_positions,
             )
             if map_again:
-                posed = remapped_poses(own, posed, some, least_kept=_LEAST_KEPT)
-            posed = split_at_seams(own, posed, some, is_further=True)
+                estimate = remapped_poses(own, estimate, some, least_kept=_LEAST_KEPT)
+            estimate = split_at_seams(own, estimate, some, is_further=True)
         except ModelError:  # too few tracks agree with these poses
-            posed = None
+            estimate = None
         used = set[str]()
-        if posed is not None:
-            registered = _registered(own, posed)
-            is_certain = posed.mapped.result.num_registered > 0
+        if estimate is not None:
+            registered = _registered(own, estimate)
+            is_certain = estimate.mapped.result.num_registered > 0
             if is_certain and len(registered & free) >= MIN_MODEL_SIZE:
                 used = registered & free
             # If a model is not used, its parts must not grow into it again.
             excluded = frozenset() if used else mapped.excluded | registered | known
-            waiting += _other_models(own, posed, excluded)
+            waiting += _other_models(own, estimate, excluded)
         lost = frozenset((known & free) - used)
-        if posed is None or not used:
+        if estimate is None or not used:
             yield TriedModel(None, lost)
             continue
         number += 1
-        yield TriedModel(FurtherPoses(own, posed, _named(image_set, free)), lost)
+        yield TriedModel(FurtherPoses(own, estimate, _named(image_set, free)), lost)
         free -= used
     _remove_further_models(run, number)
 
@@ -156,18 +156,18 @@ class _MappedModel:
 
 
 def _other_models(
-    run: Run, posed: Posed, excluded: frozenset[str] = frozenset()
+    run: Run, estimate: Estimate, excluded: frozenset[str] = frozenset()
 ) -> list[_MappedModel]:
-    models = {f: read_posed_model(run.stages / f) for f in posed.mapped.result.other_models}
+    models = {f: read_posed_model(run.stages / f) for f in estimate.mapped.result.other_models}
     return [
-        _MappedModel(posed.mapped.digest, file, model, excluded.difference(model.by_name))
+        _MappedModel(estimate.mapped.digest, file, model, excluded.difference(model.by_name))
         for file, model in models.items()
     ]
 
 
-def _registered(run: Run, posed: Posed) -> set[str]:
+def _registered(run: Run, estimate: Estimate) -> set[str]:
     """The names of the registered images."""
-    return set(read_poses(run, posed.last).by_name)
+    return set(read_poses(run, estimate.last).by_name)
 
 
 def _named(image_set: ImageSet, names: AbstractSet[str]) -> ImageSet:
@@ -212,7 +212,7 @@ def _with_cameras_of(first: PosedModel, mapped: _MappedModel) -> _MappedModel:
     return replace(mapped, model=PosedModel(cameras, mapped.model.images))
 
 
-def _poses_of_model(own: Run, first: Posed, mapped: _MappedModel) -> Kept[MappedResult]:
+def _poses_of_model(own: Run, first: Estimate, mapped: _MappedModel) -> Kept[MappedResult]:
     """Write the poses of a further model to its stages.
 
     Args:

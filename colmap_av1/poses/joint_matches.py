@@ -26,6 +26,7 @@ from colmap_av1.matching.pairs import ImageKeypoints, covisible_pairs
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.estimate import estimate_poses
+from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.further_models import further_poses
 from colmap_av1.poses.initial_pair import InitialPair, initial_pair
 from colmap_av1.poses.joint_cameras import joint_cameras
@@ -36,7 +37,6 @@ from colmap_av1.poses.matched_observations import (
     limits_of_density,
     matched_observations,
 )
-from colmap_av1.poses.posed import Posed
 from colmap_av1.poses.posed_images import PosedImages, posed_images_of, read_poses, triangulate_in
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_matches import at_same_place, tracks_of_model
@@ -134,19 +134,19 @@ def match_jointly(
     """
     if density.max_sigma is None:
         density = replace(density, max_sigma=0.0)  # the poses show which tracks have drifted
-    posed = estimate_poses(run, videos, image_set)
-    assert posed.long_range is not None
-    long_range = posed.long_range.result
-    models = [_model_of(run, posed, image_set)]
+    estimate = estimate_poses(run, videos, image_set)
+    assert estimate.long_range is not None
+    long_range = estimate.long_range.result
+    models = [_model_of(run, estimate, image_set)]
     # A second mapping would join images across turns, which the mapper of the database then bends.
     lost = set[str]()
     for tried in further_poses(
-        run, posed, image_set, lambda: [v.tracks for v in videos], map_again=False
+        run, estimate, image_set, lambda: [v.tracks for v in videos], map_again=False
     ):
         lost |= tried.lost
         if tried.poses is not None:
             own = tried.poses
-            models.append(_model_of(own.run, own.posed, own.image_set))
+            models.append(_model_of(own.run, own.estimate, own.image_set))
     first = models[0]
     models.sort(key=lambda model: -len(model.registered.images))
     in_models = {image.name for model in models for image in model.registered.images}
@@ -159,7 +159,7 @@ def match_jointly(
             "them pair by pair with --verify pairs"
         )
     with run.clock.measure("pairs"):
-        others = tracks_of_unregistered(run, posed, image_set, not_registered, density)
+        others = tracks_of_unregistered(run, estimate, image_set, not_registered, density)
         model_of = models_of_images(
             others, [model.registered.frames for model in models], image_set
         )
@@ -173,7 +173,7 @@ def match_jointly(
     warnings = _warnings(long_range, models, not_registered, others, image_set)
     if first.adjusted.seams_warning is not None:
         warnings.append(first.adjusted.seams_warning)
-    matches = posed.matches.result
+    matches = estimate.matches.result
     in_first = {image.name for image in first.registered.images}
     focal = [
         camera.mean_focal_length()
@@ -185,7 +185,7 @@ def match_jointly(
         focal_length=_focal_length(run, cameras[0]),
         matched=matched,
         links=matches.links,
-        link_tracks=posed.link_tracks,
+        link_tracks=estimate.link_tracks,
         track_lengths=paired.track_lengths,
         depth=matches.depth,
         warnings=(*matches.warnings, *warnings),
@@ -193,7 +193,7 @@ def match_jointly(
             num_registered=tuple(len(model.registered.images) for model in models),
             long_range=long_range.median,
             long_range_largest=long_range.largest,
-            dynamic_share=posed.dynamic.result.share if posed.dynamic is not None else None,
+            dynamic_share=estimate.dynamic.result.share if estimate.dynamic is not None else None,
             focal_lengths=(min(focal), max(focal)),
         ),
         poses=[model.poses_of(image_set) for model in models],
@@ -224,13 +224,13 @@ class _Model:
         return [pose_of.get(name) for name in image_set.images.names]
 
 
-def _model_of(run: Run, posed: Posed, image_set: ImageSet) -> _Model:
+def _model_of(run: Run, estimate: Estimate, image_set: ImageSet) -> _Model:
     """The finished model of a run, with those of its images that are in the set."""
-    assert posed.adjustment is not None  # `match` always adjusts
-    known = read_poses(run, posed.last)
+    assert estimate.adjustment is not None  # `match` always adjusts
+    known = read_poses(run, estimate.last)
     registered = posed_images_of(known, image_set)
-    tracks = pose_tracks(run, posed.tracks).keep_frames(registered.frames)
-    return _Model(run, posed.adjustment.result, known, registered, tracks)
+    tracks = pose_tracks(run, estimate.tracks).keep_frames(registered.frames)
+    return _Model(run, estimate.adjustment.result, known, registered, tracks)
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ def long_range_stage(
     tracks: Tracks,
     image_set: ImageSet,
     dynamic_masks: Mapping[str, Mask],
-    posed: Kept[PosesResult],
+    poses: Kept[PosesResult],
     *,
     masks_digest: str | None,
     searched_loops: bool,
@@ -65,14 +65,14 @@ def long_range_stage(
         tracks: the tracks of all sequences.
         image_set: the images.
         dynamic_masks: masks that exclude dynamic pixels, by image name.
-        posed: the stage that estimated the poses.
+        poses: the stage that estimated the poses.
         masks_digest: digest of the stage that made the masks; None without masks.
         searched_loops: whether loop closures have been searched in all videos.
         number: 1 for the check of the whole model, else the number of the adjustment after a split.
     """
 
     def make(_: Path) -> LongRangeResult:
-        registered = read_posed_images(run, posed, image_set)
+        registered = read_posed_images(run, poses, image_set)
         errors = _compared(run, tracks, image_set, dynamic_masks, registered)
         return LongRangeResult(
             median=errors.median,
@@ -84,7 +84,7 @@ def long_range_stage(
     return run_stage(
         run.stages,
         f"long_range_{number}" if number > 1 else "long_range",
-        [posed.digest, masks_digest, searched_loops],
+        [poses.digest, masks_digest, searched_loops],
         LongRangeResult,
         products=[],
         make=make,

@@ -80,7 +80,7 @@ def split_stage(
         leaps: the same for seams where it is split only if points contradict the poses.
         tracks: the tracks of all videos.
         whole: these tracks before earlier splits, which cut them at all seams.
-        rival: see `Posed`.
+        rival: see `Estimate`.
         number: number of the next adjustment.
 
     Returns:

@@ -75,14 +75,14 @@ class PosedImages:
         ]
 
 
-def read_poses(run: Run, posed: Kept[PosesResult]) -> PosedModel:
+def read_poses(run: Run, poses: Kept[PosesResult]) -> PosedModel:
     """The model of a stage."""
-    return read_posed_model(run.stages / posed.result.poses)
+    return read_posed_model(run.stages / poses.result.poses)
 
 
-def read_posed_images(run: Run, posed: Kept[PosesResult], image_set: ImageSet) -> PosedImages:
+def read_posed_images(run: Run, poses: Kept[PosesResult], image_set: ImageSet) -> PosedImages:
     """The registered images of a stage."""
-    return posed_images_of(read_poses(run, posed), image_set)
+    return posed_images_of(read_poses(run, poses), image_set)
 
 
 def posed_images_of(poses: PosedModel, image_set: ImageSet) -> PosedImages:

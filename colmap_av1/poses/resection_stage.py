@@ -34,12 +34,12 @@ _FEWEST_VIEWS = 3
 
 
 def resection_stage(
-    run: Run, tracks: Tracks, image_set: ImageSet, keyed: ImageSet, posed: Kept[PosesResult]
+    run: Run, tracks: Tracks, image_set: ImageSet, keyed: ImageSet, poses: Kept[PosesResult]
 ) -> Kept[PosesResult]:
     """Estimate the poses of the images between the key images by resection."""
 
     def make(partial: Path) -> PosesResult:
-        known = read_posed_images(run, posed, keyed)
+        known = read_posed_images(run, poses, keyed)
         with run.clock.measure("resection"):
             images = _resect(run, tracks, image_set, known)
         model = PosedModel(known.cameras, images)
@@ -49,7 +49,7 @@ def resection_stage(
     return run_stage(
         run.stages,
         "resection",
-        [posed.digest, image_set.images.names, run.context.seed],
+        [poses.digest, image_set.images.names, run.context.seed],
         PosesResult,
         products=["resected.npz"],
         make=make,

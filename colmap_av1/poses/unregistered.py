@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import DensityOptions
-from colmap_av1.poses.posed import Posed
+from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.tracks.selection import select_tracks
@@ -22,7 +22,7 @@ _LONGEST_GAP = 3
 
 def tracks_of_unregistered(
     run: Run,
-    posed: Posed,
+    estimate: Estimate,
     image_set: ImageSet,
     not_registered: Sequence[str],
     density: DensityOptions,
@@ -31,16 +31,18 @@ def tracks_of_unregistered(
 
     Args:
         run: the run.
-        posed: the first model.
+        estimate: the first model.
         image_set: all images.
         not_registered: names of the images that are not registered.
         density: which motion tracks are selected.
     """
     if not not_registered:
-        return Tracks.empty(posed.tracks.num_frames, (posed.tracks.width, posed.tracks.height))
+        return Tracks.empty(
+            estimate.tracks.num_frames, (estimate.tracks.width, estimate.tracks.height)
+        )
     frames, frame_of = image_set.images.frames, image_set.images.frame_of
-    motion = select_tracks(pose_tracks(run, posed.tracks).keep_frames(frames), density)
-    seen = Tracks.concatenate(motion, posed.link_tracks.keep_frames(frames))
+    motion = select_tracks(pose_tracks(run, estimate.tracks).keep_frames(frames), density)
+    seen = Tracks.concatenate(motion, estimate.link_tracks.keep_frames(frames))
     is_wanted = np.isin(seen.frame, [frame_of[name] for name in not_registered])
     return seen.keep_tracks(seen.having(is_wanted))
 
@@ -97,10 +99,10 @@ def models_of_images(
     image = np.searchsorted(frames, tracks.frame)
     for sequence in np.unique(image_set.sequence):
         own = np.flatnonzero(image_set.sequence == sequence)
-        posed, left = own[model_of[own] >= 0], own[model_of[own] < 0]
-        if len(posed):
-            gap = np.searchsorted(posed, left)
-            around = model_of[posed[[0, *range(len(posed)), -1]]]
+        known, left = own[model_of[own] >= 0], own[model_of[own] < 0]
+        if len(known):
+            gap = np.searchsorted(known, left)
+            around = model_of[known[[0, *range(len(known)), -1]]]
             is_within = (around[gap] == around[gap + 1]) & (np.bincount(gap)[gap] <= _LONGEST_GAP)
             model_of[left] = np.where(is_within, around[gap], -1)
         else:

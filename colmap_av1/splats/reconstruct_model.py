@@ -252,7 +252,7 @@ def model_stage(
     tracks: Tracks,
     image_set: ImageSet,
     dynamic_masks: Mapping[str, Mask],
-    posed: Kept[PosesResult],
+    poses: Kept[PosesResult],
 ) -> Kept[ModelResult]:
     """Triangulate all tracks, and write the undistorted images and the model.
 
@@ -261,13 +261,13 @@ def model_stage(
         tracks: the tracks of all sequences, without those on dynamic objects.
         image_set: all images.
         dynamic_masks: masks that exclude dynamic pixels, by image name.
-        posed: the stage that estimated the poses.
+        poses: the stage that estimated the poses.
     """
     options, clock = run.options, run.clock
     masked = run.inputs.masks is not None or options.moving == "mask"
 
     def make(partial: Path) -> ModelResult:
-        registered = read_posed_images(run, posed, image_set)
+        registered = read_posed_images(run, poses, image_set)
         cameras = output_cameras(registered.cameras, undistort=options.undistort)
         images = registered.images
         given = undistorted_masks(registered.masks, registered.camera_of_image, cameras)
@@ -310,7 +310,7 @@ def model_stage(
     return run_stage(
         run.stages,
         "model",
-        [posed.digest, how],
+        [poses.digest, how],
         ModelResult,
         into=run.output,
         products=["images", "sparse", *([_MASKS] if masked else [])],

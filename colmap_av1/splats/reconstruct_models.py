@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from colmap_av1.images.image_set import ImageSet
+from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.further_models import further_poses
 from colmap_av1.poses.placing.stage import PlaceResult, place_stage
-from colmap_av1.poses.posed import Posed
 from colmap_av1.poses.posed_images import read_posed_images
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import read_tracks_only
@@ -54,17 +54,17 @@ class FurtherModel:
 
 
 def written_model(
-    run: Run, posed: Posed, image_set: ImageSet
+    run: Run, estimate: Estimate, image_set: ImageSet
 ) -> tuple[Kept[PlaceResult], Kept[ModelResult]]:
     """Place the model in the world, and write it with the points of all tracks."""
     assert run.positions is not None
-    placed = place_stage(run, image_set, posed.last, run.positions)
-    tracks = Tracks.concatenate(posed.tracks, posed.link_tracks)
-    return placed, model_stage(run, tracks, image_set, posed.dynamic_masks, placed)
+    placed = place_stage(run, image_set, estimate.last, run.positions)
+    tracks = Tracks.concatenate(estimate.tracks, estimate.link_tracks)
+    return placed, model_stage(run, tracks, image_set, estimate.dynamic_masks, placed)
 
 
 def further_models(
-    run: Run, first: Posed, image_set: ImageSet
+    run: Run, first: Estimate, image_set: ImageSet
 ) -> tuple[tuple[FurtherModel, ...], list[str]]:
     """Write the models that are not connected with the first, each in a separate folder.
 
@@ -91,8 +91,8 @@ def further_models(
             options=replace(own.run.options, place=place),
             positions=run.positions.some(index),
         )
-        model = written_model(placing, own.posed, own.image_set)[1].result
-        images = read_posed_images(own.run, own.posed.last, own.image_set).images
+        model = written_model(placing, own.estimate, own.image_set)[1].result
+        images = read_posed_images(own.run, own.estimate.last, own.image_set).images
         names = [image.name for image in images]
         registered.update(names)
         found.append(
@@ -103,12 +103,12 @@ def further_models(
                 last=names[-1],
                 num_points=model.num_points,
                 mean_error=model.mean_error,
-                may_be_bent=_usual_scaled(own.posed) < _FEW_POINTS * _usual_scaled(first),
+                may_be_bent=_usual_scaled(own.estimate) < _FEW_POINTS * _usual_scaled(first),
             )
         )
     return tuple(found), [name for name in image_set.images.names if name not in registered]
 
 
-def _usual_scaled(posed: Posed) -> float:
+def _usual_scaled(estimate: Estimate) -> float:
     """`usual_scaled` of `AdjustedResult`; 0 for poses that are not adjusted."""
-    return posed.adjustment.result.usual_scaled if posed.adjustment is not None else 0.0
+    return estimate.adjustment.result.usual_scaled if estimate.adjustment is not None else 0.0

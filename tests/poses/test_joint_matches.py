@@ -35,8 +35,8 @@ from colmap_av1.options import (
     VerifyOptions,
 )
 from colmap_av1.poses import estimate, long_range
+from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.initial_pair import initial_pair
-from colmap_av1.poses.posed import Posed
 from colmap_av1.video.decoding import decode_frames
 
 # The pictures of the rendered clip are scaled by this factor.
@@ -184,7 +184,7 @@ def test_links_that_images_contradict_are_not_used(
     """Links at a doubtful seam replace motion unless images contradict only poses with them."""
     monkeypatch.setattr(estimate, "_unlinked_seams", lambda run, image_set, posed: [30])
     is_contradicted = property(lambda own: is_wrong and bool(own.matches.result.links.gaps))
-    monkeypatch.setattr(Posed, "is_contradicted", is_contradicted)
+    monkeypatch.setattr(Estimate, "is_contradicted", is_contradicted)
     report = match(tmp_path / "a.db", scene, image_path=joint.image_path, options=OPTIONS)
     assert not joint.links.gaps
     assert bool(report.links.gaps) != is_wrong
@@ -201,8 +201,8 @@ def test_links_are_left_out_if_images_agree_only_with_poses_without_them(
     is_right: bool,
 ) -> None:
     monkeypatch.setattr(estimate, "_unlinked_seams", lambda run, image_set, posed: [30])
-    monkeypatch.setattr(Posed, "is_contradicted", property(lambda _: True))
-    monkeypatch.setattr(Posed, "is_confirmed", property(lambda _: is_right))
+    monkeypatch.setattr(Estimate, "is_contradicted", property(lambda _: True))
+    monkeypatch.setattr(Estimate, "is_confirmed", property(lambda _: is_right))
     report = match(tmp_path / "a.db", scene, image_path=joint.image_path, options=OPTIONS)
     assert (report.links.num_links == 0) == is_right
     assert report.estimate is not None

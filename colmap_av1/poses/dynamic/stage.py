@@ -47,12 +47,12 @@ class DynamicResult:
 
 
 def dynamic_stage(
-    run: Run, tracks: Tracks, image_set: ImageSet, posed: Kept[PosesResult]
+    run: Run, tracks: Tracks, image_set: ImageSet, poses: Kept[PosesResult]
 ) -> Kept[DynamicResult]:
     """Find the dynamic regions of each image."""
 
     def make(partial: Path) -> DynamicResult:
-        registered = read_posed_images(run, posed, image_set)
+        registered = read_posed_images(run, poses, image_set)
         found: dict[str, Mask] = {}
         with run.clock.measure("dynamic"):
             for video in range(len(image_set.videos)):
@@ -67,7 +67,7 @@ def dynamic_stage(
     return run_stage(
         run.stages,
         "dynamic",
-        [posed.digest],
+        [poses.digest],
         DynamicResult,
         products=[_FILE],
         make=make,

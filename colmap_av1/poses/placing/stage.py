@@ -41,14 +41,14 @@ class PlaceResult(PosesResult):
 
 
 def place_stage(
-    run: Run, image_set: ImageSet, posed: Kept[PosesResult], positions: ImagePositions
+    run: Run, image_set: ImageSet, poses: Kept[PosesResult], positions: ImagePositions
 ) -> Kept[PlaceResult]:
     """Place the registered images by positions, gravity and a known distance.
 
     Args:
         run: the run.
         image_set: the images.
-        posed: the stage with the poses.
+        poses: the stage with the poses.
         positions: GPS positions and gravity of the images of `image_set`.
     """
     options, seed = run.options.place, run.context.seed
@@ -56,7 +56,7 @@ def place_stage(
     file = f"{run.stages.name}/in_place.npz"
 
     def make(partial: Path) -> PlaceResult:
-        registered = read_posed_images(run, posed, image_set)
+        registered = read_posed_images(run, poses, image_set)
         with run.clock.measure("place"):
             # Points are marked in the written pictures.
             cameras = output_cameras(registered.cameras, undistort=undistort)
@@ -65,8 +65,8 @@ def place_stage(
         write_place(partial, found)
         images = registered.images
         if found.is_moved:
-            poses = np.array([image.cam_from_world for image in images])
-            moved = transform_poses(found.similarity, poses)
+            before = np.array([image.cam_from_world for image in images])
+            moved = transform_poses(found.similarity, before)
             images = [
                 replace(image, cam_from_world=pose)
                 for image, pose in zip(images, moved, strict=True)
@@ -83,7 +83,7 @@ def place_stage(
     return run_stage(
         run.stages,
         "place",
-        [posed.digest, options, positions.digest, seed, undistort],
+        [poses.digest, options, positions.digest, seed, undistort],
         PlaceResult,
         into=run.output,
         products=[PLACE_FILE, file],

@@ -42,7 +42,7 @@ _LEAST_KEPT = 0.9
 
 
 @dataclass(frozen=True)
-class Posed:
+class Estimate:
     """The finished stages of the joint estimate, and the tracks that agree with its poses.
 
     Attributes:
@@ -120,7 +120,7 @@ class Posed:
 
 
 @dataclass(frozen=True)
-class Mapped:
+class KeyImageModels:
     """The matched images and the mapper's models of them.
 
     Attributes:
@@ -136,24 +136,24 @@ class Mapped:
 
 def map_key_images(
     run: Run, videos: Sequence[VideoTracks], image_set: ImageSet, *, doubted: Sequence[int]
-) -> Mapped:
+) -> KeyImageModels:
     """Match and map the key images; `doubted` as in `match_stage`."""
     matched = match_stage(run, videos, image_set, doubted)
     depth = matched.result.depth
     if not depth.is_observable:
         raise ModelError(f"{run.inputs.name}: {depth.warning}")
     keyed = image_set.some(matched.result.key_images)
-    return Mapped(matched, keyed, mapping_stage(run, matched, image_set, keyed))
+    return KeyImageModels(matched, keyed, mapping_stage(run, matched, image_set, keyed))
 
 
 def pose_images(
     run: Run,
     videos: Sequence[VideoTracks],
     image_set: ImageSet,
-    found: Mapped,
+    found: KeyImageModels,
     first: str | None,
-) -> Posed:
-    """Resect and adjust.
+) -> Estimate:
+    """Resect and adjust one of the mapper's models, and map it again if it is doubtful.
 
     Args:
         run: the run.
@@ -168,7 +168,7 @@ def pose_images(
     # Without a read-out time the tracks were not corrected.
     has_picture_positions = not any(own.read_out for own in videos)
     trusted = trusted_tracks(run, [own.tracks for own in videos], image_set)
-    posed = refined_poses(
+    estimate = refined_poses(
         run,
         found.matched,
         mapped,
@@ -177,23 +177,23 @@ def pose_images(
         keyed=found.keyed,
         has_picture_positions=has_picture_positions,
     )
-    if _is_doubtful(posed):
-        posed = remapped_poses(run, posed, image_set, least_kept=_LEAST_KEPT)
-    return replace(posed, long_range=_long_range_check(run, posed, image_set))
+    if _is_doubtful(estimate):
+        estimate = remapped_poses(run, estimate, image_set, least_kept=_LEAST_KEPT)
+    return replace(estimate, long_range=_long_range_check(run, estimate, image_set))
 
 
 def _long_range_check(
-    run: Run, posed: Posed, image_set: ImageSet, *, number: int = 1
+    run: Run, estimate: Estimate, image_set: ImageSet, *, number: int = 1
 ) -> Kept[LongRangeResult]:
     """The long-range check of the poses; `number` as in `long_range_stage`."""
     return long_range_stage(
         run,
-        posed.tracks,
+        estimate.tracks,
         image_set,
-        posed.dynamic_masks,
-        posed.last,
-        masks_digest=posed.masks_digest,
-        searched_loops=posed.matches.result.links.searched_loops,
+        estimate.dynamic_masks,
+        estimate.last,
+        masks_digest=estimate.masks_digest,
+        searched_loops=estimate.matches.result.links.searched_loops,
         number=number,
     )
 
@@ -207,57 +207,59 @@ def trusted_tracks(
     return every.split_after_frames(contradicted.tolist()), links
 
 
-def _is_doubtful(posed: Posed) -> bool:
+def _is_doubtful(estimate: Estimate) -> bool:
     """Whether the adjusted model may have a wrong focal length, or bend where links replace motion.
 
     It may bend if points connect it poorly somewhere, or if it was mapped with an assumed focal
     length.
     """
-    if posed.adjustment is None:
+    if estimate.adjustment is None:
         return False
-    matches, adjusted = posed.matches.result, posed.adjustment.result
+    matches, adjusted = estimate.matches.result, estimate.adjustment.result
     uncertain = adjusted.doubtful_seams or adjusted.scale_lost_seams or matches.assumes_focal_length
     may_bend = (matches.links.gaps or matches.links.fast) and uncertain
     return bool(adjusted.has_long_focal_length or may_bend)
 
 
-def remapped_poses(run: Run, posed: Posed, image_set: ImageSet, *, least_kept: float) -> Posed:
+def remapped_poses(
+    run: Run, estimate: Estimate, image_set: ImageSet, *, least_kept: float
+) -> Estimate:
     """Map the images again from the adjusted observations, and use that unless its cost is higher.
 
     See `remapping`. Nothing is mapped again if the adjustment did not use corners.
 
     Args:
         run: the run.
-        posed: the adjusted poses.
+        estimate: the adjusted poses.
         image_set: the images.
         least_kept: the second mapping is rejected if a smaller share of the observations agrees
             with it.
     """
-    if posed.adjustment is None or not posed.has_picture_positions:
-        return posed
-    again = remap_stage(run, image_set, posed.mapped, posed.adjustment)
+    if estimate.adjustment is None or not estimate.has_picture_positions:
+        return estimate
+    again = remap_stage(run, image_set, estimate.mapped, estimate.adjustment)
     if not again.result.fits(least_kept):
-        return posed
-    rival = None if again.result.is_clearly_better else posed.adjustment
-    posed = replace(posed, mapped=again, rival=rival)
-    return replace(posed, adjustment=_adjusted(run, posed, image_set, again, number=2))
+        return estimate
+    rival = None if again.result.is_clearly_better else estimate.adjustment
+    estimate = replace(estimate, mapped=again, rival=rival)
+    return replace(estimate, adjustment=_adjusted(run, estimate, image_set, again, number=2))
 
 
 def _adjusted(
-    run: Run, posed: Posed, image_set: ImageSet, poses: Kept[PosesResult], *, number: int = 1
+    run: Run, estimate: Estimate, image_set: ImageSet, poses: Kept[PosesResult], *, number: int = 1
 ) -> Kept[AdjustedResult]:
     """Adjust poses, see `adjustment_stage`."""
     return adjustment_stage(
         run,
-        posed.tracks,
-        posed.link_tracks,
+        estimate.tracks,
+        estimate.link_tracks,
         image_set,
         poses,
-        dynamic_masks=posed.dynamic_masks,
-        masks_digest=posed.masks_digest,
-        has_picture_positions=posed.has_picture_positions,
-        is_fast=bool(posed.matches.result.links.fast),
-        is_assumed=posed.matches.result.assumes_focal_length and number == 1,
+        dynamic_masks=estimate.dynamic_masks,
+        masks_digest=estimate.masks_digest,
+        has_picture_positions=estimate.has_picture_positions,
+        is_fast=bool(estimate.matches.result.links.fast),
+        is_assumed=estimate.matches.result.assumes_focal_length and number == 1,
         number=number,
     )
 
@@ -271,7 +273,7 @@ def refined_poses(
     image_set: ImageSet,
     keyed: ImageSet,
     has_picture_positions: bool,
-) -> Posed:
+) -> Estimate:
     """Estimate the poses of the images between the key images, and adjust all poses.
 
     Args:
@@ -281,7 +283,7 @@ def refined_poses(
         trusted: the tracks and links, see `trusted_tracks`.
         image_set: the images.
         keyed: the key images.
-        has_picture_positions: see `Posed`.
+        has_picture_positions: see `Estimate`.
     """
     tracks, links = trusted
     resection = dynamic = None
@@ -294,7 +296,7 @@ def refined_poses(
         dynamic_masks = read_dynamic_masks(run.stages)
     tracks = without_dynamic_tracks(tracks, image_set, dynamic_masks, run)
     links = without_dynamic_links(links, image_set, dynamic_masks)
-    posed = Posed(
+    estimate = Estimate(
         matches=matched,
         mapped=mapped,
         resection=resection,
@@ -306,13 +308,13 @@ def refined_poses(
         has_picture_positions=has_picture_positions,
     )
     if not run.options.mapping.adjust:
-        return posed
-    return replace(posed, adjustment=_adjusted(run, posed, image_set, poses))
+        return estimate
+    return replace(estimate, adjustment=_adjusted(run, estimate, image_set, poses))
 
 
 def split_at_seams(
-    run: Run, posed: Posed, image_set: ImageSet, *, is_further: bool = False
-) -> Posed:
+    run: Run, estimate: Estimate, image_set: ImageSet, *, is_further: bool = False
+) -> Estimate:
     """Split the model at seams with few points, and adjust the largest part separately.
 
     If pictures far apart in time contradict the poses, it is split at doubtful seams, too. The
@@ -326,7 +328,7 @@ def split_at_seams(
 
     Args:
         run: the run.
-        posed: the adjusted poses.
+        estimate: the adjusted poses.
         image_set: the images.
         is_further: the model is not the first: leaps are tested, and images with uncertain
             positions are removed even if there are no such seams.
@@ -337,48 +339,52 @@ def split_at_seams(
         other stages must not be used.
     """
     may_bend = is_further
-    whole = posed.tracks
+    whole = estimate.tracks
     for number in count(_FIRST_SPLIT):
-        if posed.adjustment is None:
+        if estimate.adjustment is None:
             break
-        adjusted = posed.adjustment.result
-        seams, num_images = posed.seams_to_split, adjusted.num_registered
-        leaps = leaping_seams(read_poses(run, posed.adjustment), image_set) if is_further else []
+        adjusted = estimate.adjustment.result
+        seams, num_images = estimate.seams_to_split, adjusted.num_registered
+        leaps = leaping_seams(read_poses(run, estimate.adjustment), image_set) if is_further else []
         may_bend |= bool(seams)
         parts = None
         if seams or leaps:
             parts = split_stage(
                 run,
                 image_set,
-                posed.mapped,
-                posed.adjustment,
+                estimate.mapped,
+                estimate.adjustment,
                 seams,
                 leaps=leaps,
-                tracks=posed.tracks,
+                tracks=estimate.tracks,
                 whole=whole,
-                rival=posed.rival,
+                rival=estimate.rival,
                 number=number,
             )
         if parts is None or parts.result.num_registered == num_images:
             if not may_bend:
                 break
             seams, leaps = [], []
-            parts = certain_stage(run, image_set, posed.mapped, posed.adjustment, number=number)
+            parts = certain_stage(
+                run, image_set, estimate.mapped, estimate.adjustment, number=number
+            )
             if parts.result.num_registered == num_images:
                 break
         if parts.result.num_registered == 0:
-            return replace(posed, mapped=parts) if is_further else posed
+            return replace(estimate, mapped=parts) if is_further else estimate
         frame_of = image_set.images.frame_of
         kept = read_poses(run, parts).by_name.keys()
         cut = [*seams, *(leap for leap in leaps if not kept >= {*leap})]
         frames = [frame_of[first] for first, _ in cut]
-        posed = replace(
-            posed,
+        estimate = replace(
+            estimate,
             mapped=parts,
-            tracks=posed.tracks.split_after_frames(frames),
+            tracks=estimate.tracks.split_after_frames(frames),
         )
-        posed = replace(posed, adjustment=_adjusted(run, posed, image_set, parts, number=number))
-        if posed.long_range is not None:
-            check = _long_range_check(run, posed, image_set, number=number)
-            posed = replace(posed, long_range=check)
-    return posed
+        estimate = replace(
+            estimate, adjustment=_adjusted(run, estimate, image_set, parts, number=number)
+        )
+        if estimate.long_range is not None:
+            check = _long_range_check(run, estimate, image_set, number=number)
+            estimate = replace(estimate, long_range=check)
+    return estimate
