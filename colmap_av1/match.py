@@ -32,7 +32,6 @@ from colmap_av1.images.recognising import check_content, frames_near
 from colmap_av1.images.track_images import MIN_IMAGES
 from colmap_av1.matching.cameras import ImageCameras, new_cameras
 from colmap_av1.matching.few_matches import matching_warning
-from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.initial_pairs import PreparedStart, prepare_start
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.mapper_limits import FORWARD_MOTION, SMALL_ANGLES
@@ -55,7 +54,7 @@ from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import VideoTracks, encoding_for_pictures
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.video_tracks import decodable_frames
-from colmap_av1.util.arrays import Bools, Ints
+from colmap_av1.util.arrays import Ints
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import STAGES, check_outside, scratch_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -399,13 +398,11 @@ class _Images:
     Attributes:
         inputs: the videos and photos.
         videos: the images of each video, and its tracks in pixels of these images.
-        fast: for each video, bool [num_frames]: frames with fast camera motion, see `fast_frames`.
         image_set: all images, numbered consecutively.
     """
 
     inputs: Inputs
     videos: Sequence[PreparedImages]
-    fast: Sequence[Bools]
     image_set: ImageSet
 
     @property
@@ -458,7 +455,7 @@ def _prepare(
             follows, and only the tracks selected for matching are kept.
         context: state of the run.
     """
-    videos, fast = [], []
+    videos = []
     for number, (video, label, masks, existing) in enumerate(
         zip(inputs.videos, inputs.labels, inputs.masks_of_videos, listed, strict=True)
     ):
@@ -471,7 +468,6 @@ def _prepare(
             next_to=next_to,
             context=context,
         )
-        fast.append(fast_frames(prepared.tracked.video.ends))
         prepared = _correct_rolling_shutter(prepared, options, context)
         if scratch is not None:
             kept = KeptPictures(scratch / f"{number}.raw")
@@ -483,7 +479,7 @@ def _prepare(
     image_set = inputs.image_set(
         [own.tracked.chosen for own in videos], [own.tracked.tracks.num_frames for own in videos]
     )
-    return _Images(inputs, videos, fast, image_set)
+    return _Images(inputs, videos, image_set)
 
 
 def _match_images(
@@ -650,10 +646,10 @@ def _match_jointly(
                 own.tracked.tracks,
                 own.tracked.chosen,
                 own.tracked.video.inter_share,
-                fast,
+                own.tracked.fast,
                 own.tracked.video.read_out,
             )
-            for own, fast in zip(images.videos, images.fast, strict=True)
+            for own in images.videos
         ],
         images.image_set,
         options.density,
@@ -679,8 +675,8 @@ def _match_pairs(
     return match_images(
         image_set,
         [
-            SelectedTracks(own.tracked.tracks, own.tracked.video.inter_share, fast)
-            for own, fast in zip(videos, images.fast, strict=True)
+            SelectedTracks(own.tracked.tracks, own.tracked.video.inter_share, own.tracked.fast)
+            for own in videos
         ],
         cameras,
         pictures_of(

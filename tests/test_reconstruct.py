@@ -477,7 +477,8 @@ def test_failed_long_range_check_adds_loop_closures_outside_fast_stretches(
     """At first, loop closures are only searched in the stretch with fast motion."""
     monkeypatch.setattr("colmap_av1.poses.long_range._MAX_ERROR", 0.0)
     monkeypatch.setattr(
-        "colmap_av1.poses.track_stage.fast_frames", lambda tracks: np.arange(tracks.num_frames) < 12
+        "colmap_av1.images.track_images.fast_frames",
+        lambda tracks: np.arange(tracks.num_frames) < 12,
     )
     for record in (copy / ".stages").glob("*.json"):
         record.unlink()

@@ -15,6 +15,7 @@ from colmap_av1.errors import ImageError, OptionError, VideoError
 from colmap_av1.images.choosing import ChosenImages, choose_images
 from colmap_av1.images.masks import VideoMasks
 from colmap_av1.options import ImageOptions, ReadOptions, TrackingOptions
+from colmap_av1.tracks.fast_frames import fast_frames
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import (
     TrackedVideo,
@@ -25,7 +26,7 @@ from colmap_av1.tracks.video_tracks import (
     times_of_frames,
     track_video,
 )
-from colmap_av1.util.arrays import Picture
+from colmap_av1.util.arrays import Bools, Picture
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.display import Display, shown_size, turned_back
 
@@ -40,10 +41,12 @@ class TrackedImages:
     Attributes:
         video: the tracks without masked pixels, in pixels of the shown pictures.
         chosen: the images.
+        fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
     """
 
     video: TrackedVideo
     chosen: ChosenImages
+    fast: Bools
 
     @property
     def tracks(self) -> Tracks:
@@ -221,6 +224,7 @@ def track_images(
             tracks=masks.on_frames(video.tracks, min_length),
             inter_share=masks.on_motion(video.inter_share),
         )
+    fast = fast_frames(video.ends)
     with context.clock.measure("choice"):
         chosen = choose(video)
         if frames is not None:
@@ -237,7 +241,7 @@ def track_images(
         )
     if masks is not None:
         video = replace(video, tracks=masks.on_tracks(video.tracks, chosen, min_length))
-    return TrackedImages(video, chosen)
+    return TrackedImages(video, chosen, fast)
 
 
 def decode_pictures(

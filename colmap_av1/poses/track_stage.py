@@ -23,11 +23,11 @@ from colmap_av1.images.track_images import (
     track_chosen_images,
     track_images,
 )
-from colmap_av1.matching.gaps import fast_frames
 from colmap_av1.matching.links.plan import images_to_link
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter, shutter_settings
 from colmap_av1.options import EncodeOptions, RefineOptions, TrackingOptions
 from colmap_av1.poses.run import Run
+from colmap_av1.tracks.fast_frames import fast_frames
 from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import TrackedVideo, count_frames
 from colmap_av1.util.arrays import Bools, Ints
@@ -139,7 +139,6 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
             run.context,
             pixel_aspect=shown.display.pixel_aspect,
         )
-        fast = fast_frames(tracked.ends)
         tracks = corrected.tracks
         if is_long:  # Later stages need no other frames of a long video.
             tracks = tracks.keep_frames(chosen.frames)
@@ -151,7 +150,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
                 names=np.array(chosen.names),  # np.savez keeps names as they are
                 frames=chosen.frames,
                 inter_share=tracked.inter_share,
-                fast=fast,
+                fast=found.fast,
             )
         check_unchanged(*source.files)
         return TracksResult(
