@@ -70,14 +70,14 @@ def contradicted_gaps(
 
 
 def unbridged_gaps(
-    report: LinkReport, suspect: SuspectGaps, matched: MatchedImages, image_set: ImageSet
+    contradicted: Sequence[int], suspect: SuspectGaps, matched: MatchedImages, image_set: ImageSet
 ) -> Bools:
-    """Find suspect gaps whose motion the first look contradicts, or that few tracks cross.
+    """Find suspect gaps whose motion the pictures contradict, or that few tracks cross.
 
     If several probes of a video are contradicted, all its gaps are included.
 
     Args:
-        report: report of the first look.
+        contradicted: the gaps whose motion the pictures contradict, see `contradicted_gaps`.
         suspect: the gaps that were examined.
         matched: the images, matched along tracks.
         image_set: the images.
@@ -85,8 +85,8 @@ def unbridged_gaps(
     Returns:
         bool [num_images - 1].
     """
-    wrong = sorted({frame for frame, _ in report.frames_of_gaps("contradicted")})
-    is_wrong = np.isin(image_set.images.frames[:-1], wrong)
+    is_wrong = np.zeros(len(suspect.maybe), np.bool_)
+    is_wrong[list(contradicted)] = True
     across = np.zeros(len(suspect.maybe))
     first, second = matched.pairs.T
     neighbours = second == first + 1

@@ -130,21 +130,25 @@ def link_images(
             )
         return {image: known[image] for image in wanted if image in known}
 
-    def link(plan: Plan) -> LinkedImages:
+    def find(plan: Plan) -> _FoundLinks:
         features = features_of(plan.wanted, plan.effort)
         with context.clock.measure("links"):
-            features = without_overlays(features, cameras)
-            return _link(
+            return _find_links(
                 plan,
                 image_set,
                 matched,
                 cameras,
-                features,
+                without_overlays(features, cameras),
                 offsets=pairs.offsets,
                 verify=verify,
                 options=links,
                 context=context,
             )
+
+    def link(plan: Plan) -> LinkedImages:
+        own = find(plan)
+        with context.clock.measure("links"):
+            return _with_links(plan, own, image_set, matched, cameras)
 
     suspect = suspect_gaps(image_set, matched, inter_share, links)
     gaps = suspect.certain
@@ -153,7 +157,7 @@ def link_images(
         first = first_look(suspect, image_set)
         also = plan.wanted if plan.effort == "light" else []
         features_of([*first.wanted, *also], "light")  # decodes the videos only once
-        gaps = gaps | unbridged_gaps(link(first).report, suspect, matched, image_set)
+        gaps = gaps | unbridged_gaps(find(first).contradicted, suspect, matched, image_set)
         plan = plan_links(image_set, matched, gaps, images_apart, links, fast=fast)
     if plan.wanted:
         linked = link(plan)
@@ -188,7 +192,26 @@ def link_images(
     return replace(linked, report=report)
 
 
-def _link(
+@dataclass(frozen=True)
+class _FoundLinks:
+    """The links of a plan.
+
+    Attributes:
+        links: the links.
+        features: the features of each examined image.
+        num_loop_closures: number of linked pairs that close a loop.
+        num_between: number of linked pairs of different videos or photos.
+        contradicted: the gaps of the plan whose motion the pictures contradict.
+    """
+
+    links: Links
+    features: dict[int, Features]
+    num_loop_closures: int
+    num_between: int
+    contradicted: list[int]
+
+
+def _find_links(
     plan: Plan,
     image_set: ImageSet,
     matched: MatchedImages,
@@ -199,8 +222,8 @@ def _link(
     verify: VerifyOptions,
     options: LinkOptions,
     context: RunContext,
-) -> LinkedImages:
-    """Link the images of a plan by their features, see `link_images`.
+) -> _FoundLinks:
+    """Match the images of a plan by their features, see `link_images`.
 
     In fast stretches, each image is matched with the images at the distances `offsets`.
     """
@@ -226,7 +249,24 @@ def _link(
     neighbours = neighbour_pairs(links, plan.between, image_set) - tried
     if neighbours:
         links = links.joined(matched_pairs(neighbours))
-    contradicted = contradicted_gaps(plan.gaps, links, matched, cameras)
+    return _FoundLinks(
+        links,
+        features,
+        num_loop_closures=len(loops & found),
+        num_between=len(between & found),
+        contradicted=contradicted_gaps(plan.gaps, links, matched, cameras),
+    )
+
+
+def _with_links(
+    plan: Plan,
+    found: _FoundLinks,
+    image_set: ImageSet,
+    matched: MatchedImages,
+    cameras: Sequence[pycolmap.Camera],
+) -> LinkedImages:
+    """Merge the links of a plan with the matches of tracks."""
+    links, features, contradicted = found.links, found.features, found.contradicted
     in_fast = {image for images in plan.fast for image in images[:-1]}
     linked = [
         i
@@ -236,8 +276,8 @@ def _link(
     merged = merge_links(matched, links, features, [*contradicted, *linked])
     report = LinkReport(
         num_links=len(links.pairs),
-        num_loop_closures=len(loops & found),
-        num_between=len(between & found),
+        num_loop_closures=found.num_loop_closures,
+        num_between=found.num_between,
         gaps=gaps_after_linking(plan.gaps, contradicted, merged, image_set),
         fast=tuple(
             (int(image_set.images.frames[own[0]]), int(image_set.images.frames[own[-1]]))
