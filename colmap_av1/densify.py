@@ -19,8 +19,9 @@ from colmap_av1.geometry.colmap_model import (
     read_model,
     write_model,
 )
-from colmap_av1.geometry.coverage import PosedCamera, coverage, coverage_of_model, views_of
+from colmap_av1.geometry.coverage import coverage, coverage_of_model
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera, views_of
 from colmap_av1.geometry.track_points import (
     LEAST_AGREEING,
     Colours,

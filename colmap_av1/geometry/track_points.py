@@ -10,9 +10,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.distant_points import splat_points
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.geometry.undistortion import Undistortion
 from colmap_av1.options import TrackOptions, TriangulateOptions

@@ -18,7 +18,7 @@ import poselib
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.coverage import PosedCamera
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.options import VerifyOptions
 from colmap_av1.options.matching import MIN_MATCHES
 from colmap_av1.util.arrays import Bools, Floats, Ints

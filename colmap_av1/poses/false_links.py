@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 from colmap_av1.geometry.colmap_model import camera_centres
-from colmap_av1.geometry.coverage import views_of
+from colmap_av1.geometry.posed_camera import views_of
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.geometry.track_points import triangulate_tracks
 from colmap_av1.images.image_set import ImageSet

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ImageError
 from colmap_av1.geometry.colmap_model import ModelImage, posed_images
-from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, make_mask
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file, natural_order
 from colmap_av1.matching.features.overlays import without_overlays

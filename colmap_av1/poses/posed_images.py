@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import ModelImage
-from colmap_av1.geometry.coverage import views_of
 from colmap_av1.geometry.masks import Mask, joined_masks
+from colmap_av1.geometry.posed_camera import views_of
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model
 from colmap_av1.geometry.track_points import TriangulatedTracks, triangulate_tracks
 from colmap_av1.images.image_set import ImageSet

@@ -9,12 +9,13 @@ import numpy as np
 from colmap_av1 import _core
 from colmap_av1.geometry.coverage import (
     CELL,
-    PosedCamera,
     nearest_depth,
     squares_of_cells,
+    valid_cells,
     without_gaps,
 )
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.spread import evenly_spread
 
@@ -122,7 +123,7 @@ def _filling(kept: ModelPoints, images: Sequence[PosedCamera], chosen: list[int]
     for number in _spread_order(len(chosen)) * _ROUNDS:
         own = images[chosen[number]]
         grid = without_gaps(np.minimum(nearest[number], nearest_depth(own, added)))
-        rows, columns = np.nonzero(np.isinf(grid) & own.valid_cells)
+        rows, columns = np.nonzero(np.isinf(grid) & valid_cells(own))
         if len(rows) == 0:
             continue
         depth = _depth_of_holes(grid, usual)

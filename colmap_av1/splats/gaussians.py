@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, writing
 from colmap_av1.geometry.colmap_model import camera_centres, model_points, posed_images, read_model
-from colmap_av1.geometry.coverage import PosedCamera, views_of
 from colmap_av1.geometry.distant_points import distance_uncertainty
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera, views_of
 from colmap_av1.util.arrays import Floats
 from colmap_av1.util.files import check_creatable, check_new_file, whole_file
 from colmap_av1.util.grouping import take_rows

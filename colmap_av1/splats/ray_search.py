@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
-from colmap_av1.geometry.coverage import PosedCamera
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.util.arrays import Bools, Floats, Ints
 
 # Pictures are reduced by an integer factor to at most this number of pixels.

@@ -13,9 +13,10 @@ import pycolmap
 
 from colmap_av1.geometry.cameras import is_undistorted
 from colmap_av1.geometry.colmap_model import ModelImage, write_model
-from colmap_av1.geometry.coverage import PosedCamera, coverage, views_of
+from colmap_av1.geometry.coverage import coverage
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera, views_of
 from colmap_av1.geometry.track_points import (
     Colours,
     fitting_in_images,

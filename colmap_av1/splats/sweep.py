@@ -14,9 +14,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.coverage import CELL, PosedCamera, nearest_in_cells, squares_of_cells
+from colmap_av1.geometry.coverage import CELL, nearest_in_cells, squares_of_cells, valid_cells
 from colmap_av1.geometry.masks import make_mask
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.splats.ray_search import LEAST_OTHERS, Grey, Swept, shrinking, smaller, sweep_image
 from colmap_av1.util.arrays import Bools, Floats
 from colmap_av1.util.grouping import groups
@@ -175,8 +176,8 @@ def _away_from_masks(view: PosedCamera) -> Bools:
     from scipy.ndimage import binary_dilation  # noqa: PLC0415 - slow to import
 
     if view.mask is None:
-        return view.valid_cells
-    masked = replace(view, mask=make_mask(~view.mask.kept)).valid_cells
+        return valid_cells(view)
+    masked = valid_cells(replace(view, mask=make_mask(~view.mask.kept)))
     return np.asarray(~binary_dilation(masked, np.ones((3, 3))))
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.splats.cloud import splat_cloud
 from colmap_av1.splats.sweep import Sweep
 from colmap_av1.util.cpus import threads_or_cpus

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError, writing
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
-from colmap_av1.geometry.coverage import PosedCamera, coverage
+from colmap_av1.geometry.coverage import coverage
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.images.files import read_image
 from colmap_av1.images.names import image_file
 from colmap_av1.util.arrays import Floats, Ints

@@ -6,8 +6,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_av1.geometry.coverage import CELL, PosedCamera, coverage, nearest_depth
+from colmap_av1.geometry.coverage import CELL, coverage, nearest_depth
 from colmap_av1.geometry.masks import make_mask
+from colmap_av1.geometry.posed_camera import PosedCamera
 
 SIZE = (160, 96)
 PLAIN = pycolmap.Camera(

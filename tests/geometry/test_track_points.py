@@ -6,8 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.geometry.track_points import (
     Colours,
     TriangulatedTracks,

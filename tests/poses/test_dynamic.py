@@ -20,9 +20,9 @@ from sequences import model_poses
 
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import ModelImage
-from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, make_mask
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.images.choosing import ChosenImages

@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import make_mask
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.poses.corners.grey_pictures import GreyPictures

@@ -7,8 +7,8 @@ import pycolmap
 import pytest
 
 from colmap_av1.errors import OptionError, WriteError
-from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.splats.gaussians import (
     Gaussians,
     check_gaussians_path,

@@ -12,9 +12,10 @@ import pytest
 from colmap_av1 import _core
 from colmap_av1.errors import OptionError
 from colmap_av1.geometry.colmap_model import camera_centres
-from colmap_av1.geometry.coverage import PosedCamera, coverage
+from colmap_av1.geometry.coverage import coverage
 from colmap_av1.geometry.distant_points import splat_points
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.options import TriangulateOptions
 from colmap_av1.splats.cloud import splat_cloud

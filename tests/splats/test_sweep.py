@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from colmap_av1 import _core
-from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import make_mask
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.splats.sweep import Sweep
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0

@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.coverage import views_of
 from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.posed_camera import views_of
 from colmap_av1.geometry.resection import resect, sightings_of
 from colmap_av1.poses.corners.grey_pictures import GreyPictures
 from colmap_av1.poses.corners.patch_matching import match_patches

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_av1 import _core
-from colmap_av1.geometry.coverage import PosedCamera
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.geometry.triangulation import TriangulatedPoints
 from colmap_av1.poses.corners.grey_pictures import GreyPictures

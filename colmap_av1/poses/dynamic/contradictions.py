@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.coverage import PosedCamera
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.geometry.triangulation import SIGMA_FLOOR
 from colmap_av1.util.arrays import Bools, Floats, Ints

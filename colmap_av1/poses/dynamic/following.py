@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.coverage import PosedCamera, views_of
 from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.posed_camera import PosedCamera, views_of
 from colmap_av1.geometry.track_points import TriangulatedTracks, triangulate_tracks
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import RefineOptions

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from colmap_av1.geometry.coverage import PosedCamera
 from colmap_av1.geometry.masks import Mask, make_mask
+from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.poses.dynamic.contradictions import Contradictions, TracksInCells
 from colmap_av1.util.arrays import Bools, Floats
 

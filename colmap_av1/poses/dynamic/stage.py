@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.coverage import views_of
 from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.posed_camera import views_of
 from colmap_av1.geometry.track_points import chaining_for_points, triangulate_tracks
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.masks import mask_tracks
