@@ -13,8 +13,8 @@ from colmap_av1.database.file import open_unaltered
 from colmap_av1.database.reading import image_ids_from_pair_id, matches_from_row, read_keypoints
 from colmap_av1.errors import DatabaseError
 from colmap_av1.geometry.colmap_model import ModelImage, posed_images
+from colmap_av1.matching.epipolar import error_by_poses
 from colmap_av1.matching.mapper_limits import MIN_INLIERS
-from colmap_av1.matching.two_view_models import error_by_poses
 from colmap_av1.poses.seams import images_in_time
 from colmap_av1.util.arrays import Bools, Floats, Ints
 

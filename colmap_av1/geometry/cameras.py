@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -169,6 +170,17 @@ def as_radial(camera: pycolmap.Camera) -> pycolmap.Camera:
     radial.model = pycolmap.CameraModelId.RADIAL
     radial.params = [*camera.params, 0.0]
     return radial
+
+
+def poselib_camera(focal_length: float) -> dict[str, Any]:
+    """A pinhole camera in PoseLib's form, with the principal point at the origin.
+
+    Args:
+        focal_length: in the units of the positions that PoseLib gets.
+    """
+    # PoseLib does not use the size.
+    params = [focal_length, 0.0, 0.0]
+    return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": params}
 
 
 def is_undistorted(camera: pycolmap.Camera) -> bool:

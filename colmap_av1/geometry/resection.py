@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.geometry.cameras import poselib_camera
 from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.tracks.tracks import Tracks
@@ -137,7 +138,7 @@ def _resect_one(
 
     if len(rays) < _MIN_INLIERS:
         return None
-    camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
+    camera = poselib_camera(focal)
     ransac = {
         "max_reproj_error": _MAX_ERROR,
         "min_iterations": _MIN_SAMPLES,

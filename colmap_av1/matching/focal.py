@@ -10,8 +10,8 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
+from colmap_av1.geometry.cameras import poselib_camera
 from colmap_av1.matching.pairs import ImageKeypoints
-from colmap_av1.matching.two_view_models import poselib_camera
 from colmap_av1.util.arrays import Floats
 
 # Focal lengths to try, in units of the longer image side: fields of view from 127 to 18 degrees.

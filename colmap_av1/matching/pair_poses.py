@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pycolmap
 
+from colmap_av1.matching.epipolar import essential_of_poses, sampson_error
 from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewGeometry
-from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
 from colmap_av1.util.arrays import Floats
 
 # About this many inliers decide as well as all of them.

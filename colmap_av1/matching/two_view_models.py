@@ -9,16 +9,20 @@ iterations.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import poselib
-import pycolmap
-from numpy.typing import NDArray
 
-from colmap_av1.geometry.posed_camera import PosedCamera
+from colmap_av1.geometry.cameras import poselib_camera
+from colmap_av1.matching.epipolar import (
+    SMALLEST_GRADIENT,
+    epipolar_inliers,
+    epipolar_terms,
+    essential_of_poses,
+)
 from colmap_av1.options import VerifyOptions
 from colmap_av1.options.matching import MIN_MATCHES
 from colmap_av1.util.arrays import Bools, Floats, Ints
@@ -36,8 +40,6 @@ _REFINEMENT = {"max_iterations": 8, "step_tol": 1e-4, "gradient_tol": 1e-6}
 # Keeps denominators above 0 if points coincide or lie on a line.
 _ROUNDING = 1e-12
 _IDENTITY = np.eye(3)
-# Keeps a division by a gradient of 0 finite.
-_SMALLEST = np.finfo(np.float64).tiny
 # A model with this share of inliers is not searched again.
 _TRUSTED_SHARE = 0.95
 # RANSAC finds at most the first share of the matches more inliers than a quick fit, and hardly ever
@@ -255,15 +257,8 @@ def _epipolar_loss(model: Model, points: MatchedPoints) -> float:
     if model.matrix is None:
         return math.inf
     algebraic, gradient = epipolar_terms(model.matrix, points.spread_a, points.spread_b)
-    squared = algebraic**2 / np.maximum(gradient, _SMALLEST)
+    squared = algebraic**2 / np.maximum(gradient, SMALLEST_GRADIENT)
     return float(np.log1p(squared).sum())
-
-
-def poselib_camera(focal_length: float) -> dict[str, Any]:
-    """A camera in PoseLib's form, with the principal point at the origin."""
-    # PoseLib does not use the size.
-    params = [focal_length, 0.0, 0.0]
-    return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": params}
 
 
 def _essential(pose: Any, focal_a: float, focal_b: float) -> Floats:
@@ -331,65 +326,6 @@ def _test(
     matrix = matrix / norm
     inliers = inliers_of(matrix, points.a, points.b, search.options.max_error)
     return Model(matrix, inliers, int(np.count_nonzero(inliers)))
-
-
-def epipolar_inliers(F: Floats, xa: Floats, xb: Floats, max_error: float) -> Bools:
-    """Matches whose Sampson error (Hartley and Zisserman, eq. 11.9) is within `max_error`."""
-    algebraic, gradient = epipolar_terms(F, xa, xb)
-    return np.asarray(algebraic**2 <= max_error**2 * gradient)
-
-
-def sampson_error(F: Floats, xa: Floats, xb: Floats) -> Floats:
-    """Sampson error of matches [2, n] (Hartley and Zisserman, eq. 11.9), float64 [n]."""
-    algebraic, gradient = epipolar_terms(F, xa, xb)
-    return np.asarray(np.abs(algebraic) / np.sqrt(np.maximum(gradient, _SMALLEST)))
-
-
-def epipolar_terms(F: Floats, xa: Floats, xb: Floats) -> tuple[Floats, Floats]:
-    """Algebraic error of matches [2, n], and the square of its gradient, float64 [n] each."""
-    lines_b = F[:, :2] @ xa + F[:, 2:]
-    lines_a = F.T[:2, :2] @ xb + F.T[:2, 2:]
-    algebraic = xb[0] * lines_b[0] + xb[1] * lines_b[1] + lines_b[2]
-    gradient = lines_b[0] ** 2 + lines_b[1] ** 2 + lines_a[0] ** 2 + lines_a[1] ** 2
-    return algebraic, gradient
-
-
-def essential_of_poses(a: Floats, b: Floats) -> Floats:
-    """The essential matrix of two images from their poses [3, 4], x_cam = R x_world + t."""
-    rotation = b[:, :3] @ a[:, :3].T
-    x, y, z = b[:, 3] - rotation @ a[:, 3]
-    return np.asarray(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation)
-
-
-def error_by_poses(
-    poses: Sequence[Floats], cameras: Sequence[pycolmap.Camera], rays: Sequence[Floats]
-) -> Floats:
-    """The Sampson error of matches by the poses of two images.
-
-    Args:
-        poses: [3, 4] cam_from_world of both images.
-        cameras: their cameras.
-        rays: [2, n] positions of the matches in both images, (x / z, y / z).
-
-    Returns:
-        float64 [m] errors in pixels; without matches at distorted positions that have no ray.
-    """
-    focal = np.mean([camera.mean_focal_length() for camera in cameras])
-    error = float(focal) * sampson_error(essential_of_poses(*poses), *rays)
-    return np.asarray(error[np.isfinite(error)])
-
-
-def error_of_pixels(
-    views: Sequence[PosedCamera], xy: Sequence[NDArray[np.floating[Any]]]
-) -> Floats:
-    """The error of matches [n, 2] in pixels of two images, see `error_by_poses`."""
-    rays = [
-        np.asarray(view.camera.cam_from_img(own.astype(np.float64))).T
-        for view, own in zip(views, xy, strict=True)
-    ]
-    return error_by_poses(
-        [view.cam_from_world for view in views], [view.camera for view in views], rays
-    )
 
 
 def transfer_inliers(H: Floats, xa: Floats, xb: Floats, max_error: float) -> Bools:

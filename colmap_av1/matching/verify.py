@@ -15,13 +15,13 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.errors import OptionError
+from colmap_av1.matching.epipolar import epipolar_inliers
 from colmap_av1.matching.pairs import ImageKeypoints
 from colmap_av1.matching.two_view_geometry import FLAT_CONFIGS, TwoViewConfig, TwoViewGeometry
 from colmap_av1.matching.two_view_models import (
     MAX_REFINED,
     Model,
     Search,
-    epipolar_inliers,
     find_fundamental,
     find_homography,
     find_pose,

@@ -22,7 +22,7 @@ from colmap_av1.geometry.posed_camera import views_of
 from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.geometry.track_points import triangulate_tracks
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.matching.two_view_models import error_of_pixels
+from colmap_av1.matching.epipolar import error_of_pixels
 from colmap_av1.poses.posed_images import FOR_POSES
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.grouping import with_equal_keys

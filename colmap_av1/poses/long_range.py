@@ -18,10 +18,10 @@ from colmap_av1.geometry.masks import Mask, make_mask
 from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.images.files import image_size, read_image
 from colmap_av1.images.names import image_file, natural_order
+from colmap_av1.matching.epipolar import error_of_pixels
 from colmap_av1.matching.features.overlays import without_overlays
 from colmap_av1.matching.features.sift import Features, extract_features, masked_features
 from colmap_av1.matching.links.matching import match_pairs
-from colmap_av1.matching.two_view_models import error_of_pixels
 from colmap_av1.options import VerifyOptions
 from colmap_av1.util.arrays import Floats, Picture
 from colmap_av1.util.progress import Progress, no_progress

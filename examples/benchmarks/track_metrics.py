@@ -19,7 +19,7 @@ from colmap_av1.database.reading import (
     read_keypoints,
 )
 from colmap_av1.evaluate.metrics.poses import frame_number
-from colmap_av1.matching.two_view_models import essential_of_poses, sampson_error
+from colmap_av1.matching.epipolar import essential_of_poses, sampson_error
 from colmap_av1.util.graphs import connected_components
 
 # Lower bounds of the classes that track lengths are counted in.
