@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import os
 import sqlite3
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from colmap_av1.check.contents import (
-    Parallax,
-    depth_of,
-    images_with_rows,
-    layout_of,
-    pairs_with_rows,
-    parallax_of,
-    readers_of,
-)
+from colmap_av1.check.contents import images_with_rows, pairs_with_rows
 from colmap_av1.check.findings import (
     Finding,
     frame_findings,
@@ -29,6 +22,8 @@ from colmap_av1.check.findings import (
     pair_findings,
     value_findings,
 )
+from colmap_av1.check.parallax import Parallax, depth_of, parallax_of
+from colmap_av1.check.versions import layout_of, readers_of
 from colmap_av1.database.file import is_new, open_unaltered
 from colmap_av1.database.reading import cameras_of
 from colmap_av1.errors import DatabaseError
@@ -144,10 +139,11 @@ def _check(connection: sqlite3.Connection, path: Path) -> DatabaseCheck:
         group = int(np.bincount(connected).max())
     parallax = parallax_of(connection, path, images, pairs, cameras)
     depth = depth_of(connection, path, images, pairs, cameras)
-    configs = [config_name(c) for c in pairs.config[pairs.num_inliers > 0].tolist()]
-    sizes = [
+    configs = Counter(config_name(c) for c in pairs.config[pairs.num_inliers > 0].tolist())
+    sizes = Counter(
         (int(cameras[c].width), int(cameras[c].height)) for c in images.camera_ids if c in cameras
-    ]
+    )
+    keypoint_columns = Counter(n for n in images.columns if n > 0)
     videos = videos_of(images.camera_ids, images.names)
     gaps = few_match_gaps(pairs.index[used], pairs.num_inliers[used], images.names, videos)
     findings = [
@@ -169,16 +165,16 @@ def _check(connection: sqlite3.Connection, path: Path) -> DatabaseCheck:
         num_images=len(images.ids),
         num_cameras=len(cameras),
         num_priors=sum(bool(camera.has_prior_focal_length) for camera in cameras.values()),
-        image_sizes={size: sizes.count(size) for size in sorted(set(sizes))},
+        image_sizes=dict(sorted(sizes.items())),
         num_keypoints=sum(map(len, images.keypoints)),
         num_matched_keypoints=sum(int(np.count_nonzero(m)) for m in pairs.matched),
-        keypoint_columns={n: images.columns.count(n) for n in sorted(set(images.columns) - {0})},
+        keypoint_columns=dict(sorted(keypoint_columns.items())),
         num_described_images=sum(n > 0 for n in images.num_descriptors),
         num_pairs=int(np.count_nonzero(pairs.num_inliers > 0)),
         num_used_pairs=int(np.count_nonzero(used)),
         num_empty_pairs=int(np.count_nonzero((pairs.num_inliers == 0) & (pairs.num_matches <= 0))),
         num_inliers=int(pairs.num_inliers[used].sum()),
-        configs={name: configs.count(name) for name in sorted(set(configs))},
+        configs=dict(sorted(configs.items())),
         num_connected_images=group,
         parallax=parallax,
         depth=depth,

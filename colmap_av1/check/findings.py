@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
-from colmap_av1.check.contents import Images, Pairs, Parallax
+from colmap_av1.check.contents import Images, Pairs
+from colmap_av1.check.parallax import Parallax
 from colmap_av1.database.layout import columns
 from colmap_av1.errors import ImageError
 from colmap_av1.geometry.cameras import camera_fault, focal_length_warning
