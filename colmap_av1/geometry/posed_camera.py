@@ -1,4 +1,4 @@
-"""A posed image: its camera, pose and mask, and projections between its pixels and the world."""
+"""Posed images: their cameras, poses and masks, and projections into them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ import pycolmap
 from colmap_av1 import _core
 from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.util.arrays import Bools, Floats, Ints
+from colmap_av1.util.grouping import groups
 
 # Number of points on each side of the image that bound the camera's field of view.
 _EDGE_POINTS = 33
@@ -153,3 +155,25 @@ def views_of(
         PosedCamera(cameras[image.camera_id], image.cam_from_world, mask)
         for image, mask in zip(images, masks, strict=True)
     ]
+
+
+def observation_errors(points: ModelPoints, views: Sequence[PosedCamera]) -> Floats:
+    """Reprojection error of each observation of some points.
+
+    Args:
+        points: the points.
+        views: the images, by the index that observations have.
+
+    Returns:
+        float64 [num_observations] in pixels, in the order of the points' observations; infinite
+        for points behind the camera and for points that its model cannot project.
+    """
+    point = points.point
+    errors = np.full(len(point), np.inf)
+    for view, own in zip(views, groups(points.image, len(views)), strict=True):
+        in_camera = view.in_camera(points.xyz[point[own]])
+        ahead = in_camera[:, 2] > 0
+        seen = own[ahead]
+        errors[seen] = np.linalg.norm(view.pixels(in_camera[ahead]) - points.xy[seen], axis=1)
+    errors[np.isnan(errors)] = np.inf
+    return errors

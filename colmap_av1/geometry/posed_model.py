@@ -18,8 +18,8 @@ import pycolmap
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import ModelImage, model_points, posed_images
 from colmap_av1.geometry.model_points import ModelPoints
+from colmap_av1.geometry.posed_camera import observation_errors, views_of
 from colmap_av1.util.arrays import Bools, Floats, Ints
-from colmap_av1.util.grouping import groups
 
 
 @dataclass(frozen=True)
@@ -76,21 +76,12 @@ def posed_model(
 
 
 def reprojection_errors(model: PosedModel) -> Floats:
-    """Reprojection error of each observation of a model's points, in pixels.
+    """Reprojection errors in pixels of the points' observations, see `observation_errors`.
 
-    Returns:
-        float64 [num_observations] in the order of the points' observations; infinite for points
-        behind the camera.
+    Args:
+        model: a model with points.
     """
-    points = model.points
-    xyz = points.xyz[points.point]
-    errors = np.full(len(points.image), np.inf)
-    for image, own in zip(model.images, groups(points.image, len(model.images)), strict=True):
-        in_camera = xyz[own] @ image.cam_from_world[:, :3].T + image.cam_from_world[:, 3]
-        ahead = in_camera[:, 2] > 0
-        shown = model.cameras[image.camera_id].img_from_cam(in_camera[ahead])
-        errors[own[ahead]] = np.linalg.norm(shown - points.xy[own[ahead]], axis=1)
-    return errors
+    return observation_errors(model.points, views_of(model.images, model.cameras))
 
 
 def write_posed_model(path: Path, model: PosedModel) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_av1.geometry.distant_points import splat_points
 from colmap_av1.geometry.model_points import ModelPoints
-from colmap_av1.geometry.posed_camera import PosedCamera
+from colmap_av1.geometry.posed_camera import PosedCamera, observation_errors
 from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.geometry.undistortion import Undistortion
 from colmap_av1.options import TrackOptions, TriangulateOptions
@@ -236,10 +236,5 @@ def fitting_in_images(
         max_error: largest mean reprojection error in pixels.
     """
     lengths = np.diff(points.offsets)
-    point = points.point
-    apart = np.empty(len(points.image))
-    for view, own in zip(views, groups(points.image, len(views)), strict=True):
-        at = view.pixels(view.in_camera(points.xyz[point[own]]))
-        apart[own] = np.linalg.norm(at - points.xy[own], axis=1)
-    error = np.bincount(point, apart, len(lengths)) / lengths
+    error = np.bincount(points.point, observation_errors(points, views), len(lengths)) / lengths
     return replace(points, error=error).take(np.flatnonzero(error <= max_error))
