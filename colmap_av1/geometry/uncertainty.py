@@ -128,9 +128,9 @@ def centre_uncertainty(model: PosedModel) -> Floats:
     of_points = np.zeros((len(points.xyz), 3, 3))
     np.add.at(of_points, point, by_point.transpose(0, 2, 1) @ by_point)
     # The inverse by eigenvectors stays accurate across the rays of points without depth.
-    sizes, axes = np.linalg.eigh(of_points)
-    damped = sizes + _DAMPING * sizes[:, -1:] + _NO_OBSERVATION
-    root_of_inverse = axes / np.sqrt(damped)[:, None, :]
+    eigenvalues, eigenvectors = np.linalg.eigh(of_points)
+    damped = eigenvalues + _DAMPING * eigenvalues[:, -1:] + _NO_OBSERVATION
+    root_of_inverse = eigenvectors / np.sqrt(damped)[:, None, :]
     mixed = by_pose.transpose(0, 2, 1) @ by_point @ root_of_inverse[point]
     order = np.lexsort([point, image])
     rows = np.searchsorted(image[order], np.arange(num_images + 1))
@@ -181,5 +181,7 @@ def _similarity_moves(centres: Floats) -> Floats:
     moves[:, :, :3] = np.eye(3)
     moves[:, :, 3:6] = _cross(centres)
     moves[:, :, 6] = centres
-    basis, sizes, _ = np.linalg.svd(moves.reshape(-1, _GAUGE_FREEDOMS), full_matrices=False)
-    return np.asarray(basis[:, sizes > _ON_A_LINE * sizes[0]])
+    basis, singular_values, _ = np.linalg.svd(
+        moves.reshape(-1, _GAUGE_FREEDOMS), full_matrices=False
+    )
+    return np.asarray(basis[:, singular_values > _ON_A_LINE * singular_values[0]])

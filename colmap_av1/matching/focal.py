@@ -111,8 +111,8 @@ def estimate_focal_length(
                     xa, xb = views[row]
                     if fisheye:
                         xa, xb = (_as_pinhole(x, float(tried[k])) for x in (xa, xb))
-                    of_pose = pose_loss(xa, xb, float(tried[k]), seed)
-                    loss[row, k] = math.log(of_pose + _LEAST_LOSS)
+                    pair_loss = pose_loss(xa, xb, float(tried[k]), seed)
+                    loss[row, k] = math.log(pair_loss + _LEAST_LOSS)
 
     # Half of the pairs locate the minimum roughly. Then all pairs are evaluated around the minimum
     # of all and of either half, until each of these minima lies between evaluated samples.

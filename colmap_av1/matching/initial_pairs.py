@@ -25,13 +25,13 @@ from colmap_av1.matching.mapper_limits import (
 )
 from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.matching.pair_poses import (
-    contradicted_angle,
+    angle_if_contradicted,
+    angle_if_wrong,
     is_wrong_rotation,
     pair_pose,
     rotations_of_homography,
     some_inliers,
     triangulation_angle,
-    wrong_angle,
 )
 from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.progress import Clock
@@ -230,10 +230,10 @@ class _Candidates:
             poses[k] = known_pose
             if known_pose is not None:
                 known_along[k] = abs(known_pose[2, 3])
-            wrong = contradicted_angle(geometry, some)
+            wrong = angle_if_contradicted(geometry, some)
             if wrong is None and known_pose is not None:
                 rotations = [pose[:, :3], *rotations_of_homography(geometry, some)]
-                wrong = wrong_angle(rotations, known_pose[:, :3], some.rays)
+                wrong = angle_if_wrong(rotations, known_pose[:, :3], some.rays)
             if wrong is not None:
                 is_wrong[k], angle[k] = True, wrong
         is_sound = ~is_wrong & ~np.isnan(known_along if known else angle)

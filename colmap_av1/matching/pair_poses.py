@@ -106,8 +106,19 @@ def rotations_of_homography(geometry: TwoViewGeometry, inliers: PairInliers) -> 
     ]
 
 
-def wrong_angle(rotations: Sequence[Floats], known: Floats, rays: Sequence[Floats]) -> float | None:
-    """Largest triangulation angle in degrees of rotations that contradict the known one."""
+def angle_if_wrong(
+    rotations: Sequence[Floats], known: Floats, rays: Sequence[Floats]
+) -> float | None:
+    """Largest triangulation angle of the rotations that contradict the known one.
+
+    Args:
+        rotations: float64 [3, 3] possible rotations to the second camera.
+        known: float64 [3, 3] the known rotation.
+        rays: float64 [3, n] unit vectors to the matches of both images.
+
+    Returns:
+        The angle in degrees; None if no rotation contradicts the known one.
+    """
     angles = [(triangulation_angle(rotation, rays), rotation) for rotation in rotations]
     return max(
         (angle for angle, own in angles if is_wrong_rotation(own, known, angle)),
@@ -137,8 +148,17 @@ def is_wrong_rotation(rotation: Floats, known: Floats, angle: float) -> bool:
     return bool(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) > _WRONG * angle)
 
 
-def contradicted_angle(geometry: TwoViewGeometry, inliers: PairInliers) -> float | None:
-    """Triangulation angle of the homography's pose in degrees, if the matches contradict it."""
+def angle_if_contradicted(geometry: TwoViewGeometry, inliers: PairInliers) -> float | None:
+    """Triangulation angle of the homography's pose, if the matches contradict it.
+
+    Args:
+        geometry: the geometry of the pair.
+        inliers: some of its inliers.
+
+    Returns:
+        The angle in degrees; None if the matches agree with the pose, or if the pair is not flat or
+        lacks an essential matrix.
+    """
     of_pair = geometry.E
     if geometry.config not in FLAT_CONFIGS or of_pair is None or geometry.H is None:
         return None

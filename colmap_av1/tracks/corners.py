@@ -176,5 +176,12 @@ def _as_tracks(guide: Tracks, seen: list[tuple[int, Ints, _Floats]], scale: _Flo
     number = np.concatenate([[], *(n for _, n, _ in seen)]).astype(np.int64)
     xy = np.concatenate([np.empty((0, 2), np.float32), *(at for _, _, at in seen)]) * scale
     frame = np.repeat([f for f, _, _ in seen], [len(n) for _, n, _ in seen]).astype(np.int32)
-    sigma = _SIGMA * float(scale.max())
-    return guide.of_observations(number, frame, xy, sigma, min_length=_MIN_IMAGES)
+    return Tracks.from_observations(
+        guide.num_frames,
+        (guide.width, guide.height),
+        track=number,
+        frame=frame,
+        xy=xy,
+        sigma=_SIGMA * float(scale.max()),
+        min_length=_MIN_IMAGES,
+    )

@@ -143,18 +143,22 @@ class Tracks:
             confirmed=np.concatenate([video.confirmed for video in videos]),
         )
 
-    def of_observations(
-        self,
+    @staticmethod
+    def from_observations(
+        num_frames: int,
+        size: tuple[int, int],
+        *,
         track: NDArray[np.integer[Any]],
         frame: NDArray[np.int32],
         xy: NDArray[np.floating[Any]],
         sigma: float,
-        *,
         min_length: int,
     ) -> Tracks:
-        """Make other tracks through frames of the same number and size from their observations.
+        """Make tracks from their observations.
 
         Args:
+            num_frames: number of frames of the video.
+            size: (width, height) in pixels of the pictures that positions refer to.
             track: integers [n] number of the track of each observation. A track is observed at most
                 once in a frame.
             frame: int32 [n] display index of its frame.
@@ -169,8 +173,10 @@ class Tracks:
         order = np.lexsort((frame, track))
         order = order[lengths[track[order]] >= min_length]
         lengths = lengths[lengths >= min_length]
-        return replace(
-            self,
+        return Tracks(
+            num_frames=num_frames,
+            width=size[0],
+            height=size[1],
             offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
             frame=frame[order].astype(np.int32),
             xy=xy[order].astype(np.float32),

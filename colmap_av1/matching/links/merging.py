@@ -144,5 +144,12 @@ def links_as_tracks(
     twice = (np.diff(label[order]) == 0) & (np.diff(frame[order]) == 0)
     clear = ~np.isin(label, label[order][1:][twice])
     xy = np.concatenate([features[i].xy for i in images])
-    no_tracks = Tracks.empty(num_frames, size)
-    return no_tracks.of_observations(label[clear], frame[clear], xy[clear], _SIGMA, min_length=2)
+    return Tracks.from_observations(
+        num_frames,
+        size,
+        track=label[clear],
+        frame=frame[clear],
+        xy=xy[clear],
+        sigma=_SIGMA,
+        min_length=2,
+    )

@@ -126,8 +126,15 @@ def match_patches(
         found.append(matches)
         progress(done)
     own, image, at = (np.concatenate(column) for column in zip(*found, strict=True))
-    sigma = float(tracks.sigma.max(initial=0.0))
-    return tracks.of_observations(own, frames[image], at, sigma, min_length=_MIN_IMAGES)
+    return Tracks.from_observations(
+        tracks.num_frames,
+        (tracks.width, tracks.height),
+        track=own,
+        frame=frames[image],
+        xy=at,
+        sigma=float(tracks.sigma.max(initial=0.0)),
+        min_length=_MIN_IMAGES,
+    )
 
 
 def _cut(
