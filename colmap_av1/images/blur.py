@@ -106,9 +106,9 @@ def blur_warning(files: Sequence[Path]) -> str | None:
     greys = [grey_within(read_image(file), _DETAIL_SIZE) for file in some]
     if float(np.median([_detail(grey) for grey in greys])) < _MIN_DETAIL:
         return (
-            f"{files[0].parent}: the images are blurred, dark or lack texture; half their size "
-            "would show as much: their tracks are few and inaccurate; film in focus, in good light "
-            "and more slowly"
+            f"{files[0].parent}: the images are blurred, dark or lack texture; images of half "
+            "the size would show the same detail: their tracks are few and inaccurate; film in "
+            "focus, in good light and more slowly"
         )
     directions = np.median([_detail_by_direction(grey) for grey in greys], axis=0)
     if directions.min() < _MIN_OF_RICHEST * directions.max():

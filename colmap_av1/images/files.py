@@ -319,7 +319,7 @@ def read_image(path: Path) -> Picture:
     # COLMAP ignores the EXIF orientation, too.
     how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     if not may_read(path):
-        raise ImageError(f"{path}: no permission to read it: change that")
+        raise ImageError(f"{path}: permission denied: change its permissions")
     image = None
     try:
         # OpenCV cannot open paths that are not UTF-8.
@@ -361,7 +361,7 @@ def image_size(path: Path) -> tuple[int, int]:
             if container.streams.video:
                 size = container.streams.video[0].width, container.streams.video[0].height
     except PermissionError as error:
-        raise ImageError(f"{path}: no permission to read it: change that") from error
+        raise ImageError(f"{path}: permission denied: change its permissions") from error
     except (av.error.FFmpegError, OSError, ValueError) as error:
         check_memory(error)
         raise ImageError(f"{path}: is not a readable image: remove it") from error

@@ -1,7 +1,6 @@
-"""Limits of COLMAP's mappers: default ones, and those of an initial pair that `match` chooses.
+"""Thresholds of COLMAP's mappers for pairs, initial pairs and registration.
 
-They are the limits for using a pair of images, for beginning with it, and for registering further
-images.
+They are the defaults, and those that `match` recommends.
 """
 
 from __future__ import annotations
