@@ -21,7 +21,7 @@ from colmap_av1.poses.adjusting import (
     without_sparse_images,
 )
 from colmap_av1.poses.corners.in_images import corners_in_images
-from colmap_av1.poses.dynamic.following import follow_behind, has_changing_masks
+from colmap_av1.poses.dynamic.following import follow_occluded, has_changing_masks
 from colmap_av1.poses.posed_images import (
     FOR_POSES,
     FROM_PICTURES,
@@ -126,18 +126,18 @@ def adjustment_stage(
     has_gaps = bool(dynamic_masks) or has_changing_masks(image_set)
 
     def make(partial: Path) -> AdjustedResult:
-        registered = read_posed_images(run, poses, image_set)
+        registered = read_posed_images(run, poses, image_set).masked_by(dynamic_masks)
         # Not kept in a variable: the long tracks need several times the memory of the selection.
         spread = select_tracks(pose_tracks(run, tracks).keep_frames(registered.frames), _ADJUSTED)
         if has_picture_positions and has_gaps:
             with run.clock.measure("refinement"):
-                spread = follow_behind(run, dynamic_masks, spread, registered)
+                spread = follow_occluded(run, spread, registered)
         linked = links.keep_frames(registered.frames)
         sets = [(spread, FOR_POSES), (linked, FOR_POSES)]
         if has_picture_positions:
             with run.clock.measure("refinement"):
                 guide = Tracks.concatenate(spread, linked)
-                followed, registered = corners_in_images(run, dynamic_masks, guide, registered)
+                followed, registered = corners_in_images(run, guide, registered)
             few = spread.every_nth(_NTH_WITH_CORNERS).split_to_length(_LENGTH_WITH_CORNERS)
             sets = [(few, _WITH_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
         with run.clock.measure("adjustment"):

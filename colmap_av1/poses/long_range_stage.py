@@ -72,8 +72,8 @@ def long_range_stage(
     """
 
     def make(_: Path) -> LongRangeResult:
-        registered = read_posed_images(run, poses, image_set)
-        errors = _compared(run, tracks, image_set, dynamic_masks, registered)
+        registered = read_posed_images(run, poses, image_set).masked_by(dynamic_masks)
+        errors = _compared(run, tracks, image_set, registered)
         return LongRangeResult(
             median=errors.median,
             largest=errors.largest,
@@ -95,18 +95,16 @@ def _compared(
     run: Run,
     tracks: Tracks,
     image_set: ImageSet,
-    dynamic_masks: Mapping[str, Mask],
     registered: PosedImages,
 ) -> LongRangeErrors:
     with run.clock.measure("long range"):
         points_of = _points_by_image(run, tracks, registered)
         check = LongRangeCheck(registered.images, registered.cameras, points_of.__getitem__)
-        masks = registered.masks_with(dynamic_masks)
         indices = np.searchsorted(image_set.images.frames, registered.frames[check.wanted]).tolist()
         index_of = dict(zip(indices, check.wanted, strict=True))
         for done, (k, picture) in enumerate(run.pictures(image_set)(indices), start=1):
             index = index_of[k]
-            check.add(index, picture, masks[index])
+            check.add(index, picture, registered.masks[index])
             run.progress("long range", done, len(indices))
         return check.result()
 

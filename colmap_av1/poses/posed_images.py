@@ -67,12 +67,12 @@ class PosedImages:
         """The camera of each image."""
         return [self.cameras[image.camera_id] for image in self.images]
 
-    def masks_with(self, others: Mapping[str, Mask]) -> list[Mask | None]:
-        """The mask of each image, joined with the one of its name in `others`, if any."""
-        return [
-            joined_masks(mask, others.get(image.name))
-            for mask, image in zip(self.masks, self.images, strict=True)
-        ]
+    def masked_by(self, others: Mapping[str, Mask]) -> PosedImages:
+        """The images with their masks joined with those of their names in `others`, if any."""
+        masks = zip(self.masks, self.images, strict=True)
+        return replace(
+            self, masks=tuple(joined_masks(mask, others.get(own.name)) for mask, own in masks)
+        )
 
 
 def read_poses(run: Run, poses: Kept[PosesResult]) -> PosedModel:

@@ -272,7 +272,7 @@ def model_stage(
         cameras = output_cameras(registered.cameras, undistort=options.undistort)
         images = registered.images
         given = undistorted_masks(registered.masks, registered.camera_of_image, cameras)
-        joined = registered.masks_with(dynamic_masks)
+        joined = registered.masked_by(dynamic_masks).masks
         valid = undistorted_masks(joined, registered.camera_of_image, cameras)
         views = views_of(images, cameras, valid)
         with clock.measure("points"):

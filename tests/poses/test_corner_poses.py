@@ -134,7 +134,7 @@ def test_links_join_images_across_a_gap_in_the_tracks(
     )
     monkeypatch.setattr(
         "colmap_av1.poses.adjustment_stage.corners_in_images",
-        lambda _run, _masks, _guide, known: (tracks, known),
+        lambda _run, _guide, known: (tracks, known),
     )
     adjusted = adjustment_stage(
         cast(Any, run),

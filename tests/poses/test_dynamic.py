@@ -20,7 +20,7 @@ from sequences import model_poses
 
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import ModelImage
-from colmap_av1.geometry.masks import Mask, make_mask
+from colmap_av1.geometry.masks import make_mask
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.geometry.track_points import TriangulatedTracks
@@ -37,7 +37,7 @@ from colmap_av1.options import (
     TriangulateOptions,
 )
 from colmap_av1.poses.dynamic.contradictions import Contradictions, TracksInCells, tracks_in_cells
-from colmap_av1.poses.dynamic.following import expect_in_views, follow_behind
+from colmap_av1.poses.dynamic.following import expect_in_views, follow_occluded
 from colmap_av1.poses.dynamic.regions import dynamic_cells, shares_above_usual, strong_patches
 from colmap_av1.poses.dynamic.short_tracks import static_points
 from colmap_av1.poses.dynamic.stage import without_dynamic_links
@@ -320,14 +320,12 @@ class Passed:
 
     Attributes:
         run: the run after the preceding stages.
-        moving: masks of the band, by image name.
         tracks: tracks of the scene, cut at the band.
         registered: the posed images.
         left: the first column of the band in each image.
     """
 
     run: Run
-    moving: dict[str, Mask]
     tracks: Tracks
     registered: PosedImages
     left: NDArray[np.int64]
@@ -370,8 +368,8 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
     )
     some = DensityOptions(max_tracks_per_image=400, spacing=20.0, min_images=3, max_sigma=0.0)
     cut = mask_tracks(every.keep_frames(frames), dict(enumerate(masks)), 4)
-    moving = dict(zip(names, masks, strict=True))
-    return Passed(run, moving, select_tracks(cut, some), registered, left)
+    registered = registered.masked_by(dict(zip(names, masks, strict=True)))
+    return Passed(run, select_tracks(cut, some), registered, left)
 
 
 def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -390,11 +388,11 @@ def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
 
 def test_nothing_is_followed_in_a_video_without_registered_images(passed: Passed) -> None:
     others = replace(passed.registered, sequence=np.ones_like(passed.registered.sequence))
-    assert follow_behind(passed.run, passed.moving, passed.tracks, others).num_tracks == 0
+    assert follow_occluded(passed.run, passed.tracks, others).num_tracks == 0
 
 
 def test_tracks_continue_behind_a_passing_object(passed: Passed) -> None:
-    found = follow_behind(passed.run, passed.moving, passed.tracks, passed.registered)
+    found = follow_occluded(passed.run, passed.tracks, passed.registered)
     assert found.num_observations > 1.1 * passed.tracks.num_observations
     assert len(off_behind(passed.tracks)[0]) < 10
     taken_up, off = off_behind(found)
@@ -411,7 +409,7 @@ def test_camera_that_stands_still_gives_no_tracks(passed: Passed) -> None:
     pose = passed.registered.images[0].cam_from_world
     still = [replace(image, cam_from_world=pose) for image in passed.registered.images]
     registered = replace(passed.registered, images=still)
-    assert follow_behind(passed.run, passed.moving, passed.tracks, registered).num_tracks == 0
+    assert follow_occluded(passed.run, passed.tracks, registered).num_tracks == 0
 
 
 @pytest.mark.parametrize("pixels", [1, 7])
@@ -423,9 +421,7 @@ def test_wrong_poses_do_not_continue_tracks_wrongly(passed: Passed, pixels: floa
         for frame, image in enumerate(passed.registered.images)
     ]
     early = passed.tracks.keep_frames(np.arange(20, dtype=np.int32))
-    found = follow_behind(
-        passed.run, passed.moving, early, replace(passed.registered, images=images)
-    )
+    found = follow_occluded(passed.run, early, replace(passed.registered, images=images))
     first = np.repeat(found.offsets[:-1], found.lengths)
     late = np.flatnonzero(found.frame >= 20)
     if pixels > 1:  # outside the search window

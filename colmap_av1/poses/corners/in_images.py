@@ -32,29 +32,26 @@ _MAX_ERROR = 8.0
 
 
 def corners_in_images(
-    run: Run, dynamic_masks: Mapping[str, Mask], tracks: Tracks, registered: PosedImages
+    run: Run, tracks: Tracks, registered: PosedImages
 ) -> tuple[Tracks, PosedImages]:
     """Find corners in the images of all videos, and correct poses that contradict them.
 
     Args:
         run: inputs and options of the run.
-        dynamic_masks: masks that exclude dynamic pixels, by image name.
         tracks: tracks of static points, which guide the search.
-        registered: the registered images.
+        registered: the registered images; their masks exclude dynamic pixels.
 
     Returns:
         The corners as tracks, and the images with the corrected poses.
     """
-    masks = registered.masks_with(dynamic_masks)
     with GreyPictures(run.stages) as pictures:
-        followed = _followed(run, masks, tracks, registered, pictures)
+        followed = _followed(run, tracks, registered, pictures)
         registered = resect_from_corners(run, followed, registered)
-        return _match_in_all(run, masks, followed, registered, pictures), registered
+        return _match_in_all(run, followed, registered, pictures), registered
 
 
 def _followed(
     run: Run,
-    masks: list[Mask | None],
     tracks: Tracks,
     registered: PosedImages,
     pictures: GreyPictures,
@@ -67,7 +64,7 @@ def _followed(
         if len(own) == 0:
             continue
         first = int(registered.first_frame[video])
-        mask_of = {int(registered.frames[i]) - first: masks[i] for i in own}
+        mask_of = {int(registered.frames[i]) - first: registered.masks[i] for i in own}
         guide = tracks.keep_frames(registered.frames[own])
         num_frames = max(mask_of) + 1
         guide = replace(guide, frame=guide.frame - np.int32(first), num_frames=num_frames)
@@ -89,14 +86,13 @@ def _followed(
 
 def _match_in_all(
     run: Run,
-    masks: list[Mask | None],
     corners: Tracks,
     registered: PosedImages,
     pictures: GreyPictures,
 ) -> Tracks:
     """Locate corners in all images that see them, see `match_patches`."""
     found = triangulate_in(run, registered, corners, FROM_PICTURES)
-    views = views_of(registered.images, registered.cameras, masks)
+    views = views_of(registered.images, registered.cameras, registered.masks)
     report = progress_in(run.progress, "refinement", len(views))
     return match_patches(
         found,

@@ -6,13 +6,12 @@ points next to it along with it. Such tracks make the poses worse, however many 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.posed_camera import PosedCamera, views_of
 from colmap_av1.geometry.track_points import TriangulatedTracks, triangulate_tracks
 from colmap_av1.images.image_set import ImageSet
@@ -41,9 +40,7 @@ def has_changing_masks(image_set: ImageSet) -> bool:
     return any(len({image_set.masks[image] for image in images}) > 1 for images in videos)
 
 
-def follow_behind(
-    run: Run, dynamic_masks: Mapping[str, Mask], tracks: Tracks, registered: PosedImages
-) -> Tracks:
+def follow_occluded(run: Run, tracks: Tracks, registered: PosedImages) -> Tracks:
     """Refine tracks on the pictures, and find their points in more images.
 
     A point is searched at its projection in images without an observation of it, from its first
@@ -53,14 +50,12 @@ def follow_behind(
 
     Args:
         run: inputs and options of the run.
-        dynamic_masks: masks that exclude dynamic pixels, by image name.
         tracks: tracks of static points; few, since each is searched in many pictures.
-        registered: the registered images.
+        registered: the registered images; their masks exclude dynamic pixels.
 
     Returns:
         A track for each point, in these images, without outliers.
     """
-    masks = registered.masks_with(dynamic_masks)
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.shown)):
         own = np.flatnonzero(registered.sequence == video)
@@ -68,7 +63,7 @@ def follow_behind(
             continue
         frames = registered.frames[own]
         images = [registered.images[i] for i in own]
-        views = views_of(images, registered.cameras, [masks[i] for i in own])
+        views = views_of(images, registered.cameras, [registered.masks[i] for i in own])
         triangulated = triangulate_tracks(
             tracks,
             frames,
