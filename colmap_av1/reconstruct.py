@@ -297,7 +297,7 @@ def _check_no_model_of_others(output: Path, inputs: Inputs) -> None:
 
 def _as_converted(options: ReconstructOptions) -> MatchOptions:
     """The options for the conversion of videos."""
-    if not options.mapping.adjust:
+    if not options.poses.adjust:
         return options.match
     return replace(options.match, encode=encoding_for_pictures(options.match.encode))
 

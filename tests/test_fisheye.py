@@ -21,9 +21,9 @@ from colmap_av1 import (
     DensityOptions,
     ImageOptions,
     MapOptions,
-    MapperOptions,
     MatchOptions,
     PlaceOptions,
+    PoseOptions,
     ReconstructOptions,
     TriangulateOptions,
     densify,
@@ -42,7 +42,7 @@ MATCHING = MatchOptions(
 )
 OPTIONS = ReconstructOptions(
     match=MATCHING,
-    mapping=MapperOptions(pose_tracks_per_image=400),
+    poses=PoseOptions(pose_tracks_per_image=400),
     triangulate=TriangulateOptions(points="survey"),
     image_type="png",
 )

@@ -401,7 +401,7 @@ def test_model_of_two_images_is_an_error(copy: Path, monkeypatch: pytest.MonkeyP
 
     stages = importlib.import_module("colmap_av1.poses.mapping_stage")
     monkeypatch.setattr(stages, "map_poses", map_two)
-    other = replace(OPTIONS, mapping=replace(OPTIONS.mapping, mapper="incremental"))
+    other = replace(OPTIONS, poses=replace(OPTIONS.poses, mapper="incremental"))
     with pytest.raises(ModelError, match="--mapper"):
         reconstruct(SCENE, copy, options=other)
 
@@ -527,8 +527,8 @@ def test_adjustment_makes_the_mapped_poses_more_accurate(
     made: ReconstructReport, truth: Truth, copy: Path
 ) -> None:
     """Without adjustment and key images, all poses are those of the mapper."""
-    mapping = replace(OPTIONS.mapping, adjust=False, key_images=False)
-    plain = reconstruct(SCENE, copy, options=replace(OPTIONS, mapping=mapping))
+    unadjusted = replace(OPTIONS.poses, adjust=False, key_images=False)
+    plain = reconstruct(SCENE, copy, options=replace(OPTIONS, poses=unadjusted))
     assert plain.num_key_images == plain.num_registered == NUM_IMAGES
     # The camera is estimated from all images in both cases.
     assert cameras_of(plain.database) == cameras_of(made.database)

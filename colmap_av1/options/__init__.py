@@ -17,7 +17,7 @@ from colmap_av1.options.model import (
     ExportOptions,
     MapOptions,
     Mapper,
-    MapperOptions,
+    PoseOptions,
     TriangulateOptions,
 )
 from colmap_av1.options.place import PlaceOptions
@@ -39,12 +39,12 @@ __all__ = [
     "LinkOptions",
     "MapOptions",
     "Mapper",
-    "MapperOptions",
     "MaskOptions",
     "MatchOptions",
     "OnExisting",
     "PairOptions",
     "PlaceOptions",
+    "PoseOptions",
     "ReadOptions",
     "ReconstructOptions",
     "RefineOptions",

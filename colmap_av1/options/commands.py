@@ -11,7 +11,7 @@ from colmap_av1.options.camera import CameraOptions
 from colmap_av1.options.fields import Options, option, part
 from colmap_av1.options.images import ImageOptions, MaskOptions
 from colmap_av1.options.matching import LinkOptions, PairOptions, VerifyOptions
-from colmap_av1.options.model import MapperOptions, TriangulateOptions
+from colmap_av1.options.model import PoseOptions, TriangulateOptions
 from colmap_av1.options.place import PlaceOptions
 from colmap_av1.options.run import RunOptions
 from colmap_av1.options.tracks import DensityOptions, RefineOptions, TrackOptions
@@ -122,7 +122,7 @@ class ReconstructOptions(Options):
         MatchOptions(),
         unused=("density", "on_existing", "images.first_number", "verify.verify"),
     )
-    mapping: MapperOptions = part(MapperOptions())
+    poses: PoseOptions = part(PoseOptions())
     triangulate: TriangulateOptions = part(TriangulateOptions())
     place: PlaceOptions = part(PlaceOptions())
     undistort: bool = option(
@@ -152,7 +152,7 @@ class ReconstructOptions(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.match.camera.single_camera is False and not self.mapping.adjust:
+        if self.match.camera.single_camera is False and not self.poses.adjust:
             raise OptionError(
                 "single_camera 0 needs the bundle adjustment to estimate the cameras: leave out "
                 "--adjust 0"

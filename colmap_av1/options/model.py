@@ -142,13 +142,13 @@ class MapOptions(Options):
 
 
 @dataclass(frozen=True)
-class MapperOptions(Options):
+class PoseOptions(Options):
     """How poses are estimated.
 
     Examples:
-        >>> from colmap_av1 import MapperOptions, ReconstructOptions
-        >>> options = ReconstructOptions(mapping=MapperOptions(mapper="incremental"))
-        >>> options.mapping.mapper
+        >>> from colmap_av1 import PoseOptions, ReconstructOptions
+        >>> options = ReconstructOptions(poses=PoseOptions(mapper="incremental"))
+        >>> options.poses.mapper
         'incremental'
     """
 

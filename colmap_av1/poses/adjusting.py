@@ -53,8 +53,8 @@ _PHASE_STEP = (5**0.5 - 1) / 2
 
 def refines_intrinsics(options: ReconstructOptions) -> bool:
     """Whether focal length and distortion are refined; by default if they are not given."""
-    if options.mapping.refine_intrinsics is not None:
-        return options.mapping.refine_intrinsics
+    if options.poses.refine_intrinsics is not None:
+        return options.poses.refine_intrinsics
     return options.match.camera.camera_params is None
 
 
@@ -111,7 +111,7 @@ def adjust_posed(
             refine_intrinsics=refines_intrinsics(run.options),
             loss_scales=loss_scales,
             seed=run.context.seed,
-            num_threads=run.options.mapping.mapper_threads,
+            num_threads=run.options.poses.mapper_threads,
             log=run.stages / log,
             max_steps=max_steps,
             tolerance=tolerance,

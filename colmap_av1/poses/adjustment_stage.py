@@ -177,7 +177,7 @@ def adjustment_stage(
             and any(map(has_long_focal_length, result.cameras.values())),
         )
 
-    given = (refine, options.mapping.mapper_threads, run.context.seed)
+    given = (refine, options.poses.mapper_threads, run.context.seed)
     return run_stage(
         run.stages,
         f"adjustment{suffix}",

@@ -176,7 +176,7 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         ModelError: no poses can be estimated.
         VideoError: nothing connects any two images.
     """
-    key = [matches_key(run, videos, image_set), run.options.mapping, run.options.moving != "keep"]
+    key = [matches_key(run, videos, image_set), run.options.poses, run.options.moving != "keep"]
     estimates = _Estimates(run, videos, image_set)
 
     def decided(

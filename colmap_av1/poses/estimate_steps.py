@@ -307,7 +307,7 @@ def refined_poses(
         dynamic_masks=dynamic_masks,
         has_picture_positions=has_picture_positions,
     )
-    if not run.options.mapping.adjust:
+    if not run.options.poses.adjust:
         return estimate
     return replace(estimate, adjustment=_adjusted(run, estimate, image_set, poses))
 

@@ -201,9 +201,9 @@ def keeps_intrinsics(model: PosedModel, first: PosedModel) -> bool:
 
 def _with_known_intrinsics(run: Run) -> Run:
     """The run, without refinement of intrinsics unless the options require it."""
-    mapping = run.options.mapping
-    mapping = replace(mapping, refine_intrinsics=bool(mapping.refine_intrinsics))
-    return replace(run, options=replace(run.options, mapping=mapping))
+    pose_options = run.options.poses
+    pose_options = replace(pose_options, refine_intrinsics=bool(pose_options.refine_intrinsics))
+    return replace(run, options=replace(run.options, poses=pose_options))
 
 
 def _with_cameras_of(first: PosedModel, mapped: _MappedModel) -> _MappedModel:

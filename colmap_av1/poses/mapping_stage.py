@@ -53,12 +53,12 @@ def mapping_stage(
 ) -> Kept[MappedResult]:
     """Estimate the poses of the key images with COLMAP's mapper."""
     options, clock = run.options, run.clock
-    mapping = options.mapping
+    pose_options = options.poses
     found_before = matched.result
     forward = found_before.forward_motion
     mappers: list[Literal["incremental", "global"]]
-    if mapping.mapper != "auto":
-        mappers = [mapping.mapper]
+    if pose_options.mapper != "auto":
+        mappers = [pose_options.mapper]
     else:
         # The global mapper needs the focal length. A zoom would mislead its estimate.
         mappers = (
@@ -68,14 +68,14 @@ def mapping_stage(
     reasons = {reason for gap in links.gaps for reason in gap.reasons}
     depends_on_links = links.num_between or reasons & {"contradicted", "few tracks"}
     # Where poses depend on links, walks with fast turns bend if the mapper ends early.
-    effort: MapperEffort = "early" if mapping.adjust and not depends_on_links else "full"
+    effort: MapperEffort = "early" if pose_options.adjust and not depends_on_links else "full"
     attempts = [
         MapOptions(
             mapper=mapper,
             forward_motion=forward and mapper == "incremental",
             refine_intrinsics=refines_intrinsics(options),
             seed=run.context.seed,
-            num_threads=mapping.mapper_threads,
+            num_threads=pose_options.mapper_threads,
         )
         for mapper in mappers
     ]
@@ -86,7 +86,7 @@ def mapping_stage(
                 # pycolmap migrates the databases that it opens to its own layout.
                 database = partial / f"{attempt.mapper}.db"
                 shutil.copyfile(run.output / "database.db", database)
-                if attempt.mapper == "global" and mapping.adjust:
+                if attempt.mapper == "global" and pose_options.adjust:
                     keep_longest_tracks(database)
                 try:
                     found = mapped_models(run, database, attempt, effort, len(keyed.sequence))
@@ -120,7 +120,7 @@ def mapping_stage(
         [
             matched.digest,
             attempts,
-            mapping.adjust,
+            pose_options.adjust,
             effort,
         ],
         MappedResult,

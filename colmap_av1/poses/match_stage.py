@@ -75,13 +75,13 @@ def read_links(stages: Path) -> tuple[Tracks, NDArray[np.int32]]:
 
 def matches_key(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> list[Any]:
     """What the matches depend on, except `doubted`, for `run_stage`."""
-    match, mapping = run.options.match, run.options.mapping
+    match, pose_options = run.options.match, run.options.poses
     return [
         [own.digest for own in videos],
         image_set.videos,
         run.photo_digests,
         (match.tracks, match.pairs, match.verify, match.camera, match.links),
-        (_pose_density(run), mapping.key_images),
+        (_pose_density(run), pose_options.key_images),
         match.run.seed,
         run.positions.digest if run.positions is not None else None,
     ]
@@ -155,7 +155,7 @@ def _key_images(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) ->
 
     All photos are key images, since no track connects them.
     """
-    if not run.options.mapping.key_images:
+    if not run.options.poses.key_images:
         return list(range(len(image_set.sequence)))
     index: list[int] = []
     for video, own in enumerate(videos):
@@ -168,11 +168,11 @@ def _key_images(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) ->
 
 def _pose_density(run: Run) -> DensityOptions:
     """Density of the tracks that poses are estimated from."""
-    mapping = run.options.mapping
+    pose_options = run.options.poses
     return DensityOptions(
         preset="sparse",
-        max_tracks_per_image=mapping.pose_tracks_per_image,
-        spacing=mapping.pose_spacing,
+        max_tracks_per_image=pose_options.pose_tracks_per_image,
+        spacing=pose_options.pose_spacing,
     )
 
 

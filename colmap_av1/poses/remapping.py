@@ -140,8 +140,8 @@ def remap_stage(
             from_initial=from_initial,
         )
 
-    match, mapping = run.options.match, run.options.mapping
-    given = (match.pairs, match.verify, run.context.seed, mapping.mapper_threads)
+    match, pose_options = run.options.match, run.options.poses
+    given = (match.pairs, match.verify, run.context.seed, pose_options.mapper_threads)
     return run_stage(
         run.stages,
         name,
@@ -171,7 +171,7 @@ def _map_tracks(
         mapper="global",
         refine_intrinsics=refines_intrinsics(options),
         seed=run.context.seed,
-        num_threads=options.mapping.mapper_threads,
+        num_threads=options.poses.mapper_threads,
     )
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "database.db"

@@ -44,7 +44,7 @@ def with_second_distortion(run: Run, model: PosedModel) -> PosedModel:
     }
     options = run.options
     is_given = run.cameras is not None or options.match.camera.camera_model is not None
-    is_adjusted = options.mapping.adjust and refines_intrinsics(options)
+    is_adjusted = options.poses.adjust and refines_intrinsics(options)
     if is_given or not is_adjusted or not numbers:
         return model
 

@@ -160,13 +160,13 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
             (*tracked.warnings, *corrected.warnings),
         )
 
-    mapping = run.options.mapping
+    pose_options = run.options.poses
     # The images of a long video are chosen by the tracks that poses are estimated from, and include
     # those that links need.
     choice = (
         run.options.max_images,
-        mapping.pose_tracks_per_image,
-        mapping.pose_spacing,
+        pose_options.pose_tracks_per_image,
+        pose_options.pose_spacing,
         options.links,
     )
     shutter = shutter_settings(options.camera)
@@ -259,7 +259,7 @@ def key_images_of_video(
         inter_share: see `TrackedVideo`.
         fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
     """
-    mapping, links = run.options.mapping, run.options.match.links
+    pose_options, links = run.options.poses, run.options.match.links
     always = images_to_link(inter_share, chosen.frames, links)
     if links.links != "none":
         always |= fast[chosen.frames]
@@ -267,8 +267,8 @@ def key_images_of_video(
         tracks,
         chosen.frames,
         always,
-        spacing=mapping.pose_spacing,
-        num_cells=mapping.pose_tracks_per_image,
+        spacing=pose_options.pose_spacing,
+        num_cells=pose_options.pose_tracks_per_image,
     )
 
 

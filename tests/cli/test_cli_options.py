@@ -177,7 +177,7 @@ def test_nested_options_are_built_from_arguments() -> None:
     assert parse("", CompareOptions) == CompareOptions()
     made = parse("--mapper global --points survey --min_angle 3 --cell 2", ReconstructOptions)
     assert isinstance(made, ReconstructOptions)
-    assert (made.mapping.mapper, made.triangulate.min_angle) == ("global", 3)
+    assert (made.poses.mapper, made.triangulate.min_angle) == ("global", 3)
     assert made.match.tracks.cell == 2
 
 

@@ -17,7 +17,7 @@ from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.image_set import ImageSet
-from colmap_av1.options import MapperOptions
+from colmap_av1.options import PoseOptions
 from colmap_av1.poses.adjustment_stage import adjustment_stage
 from colmap_av1.poses.corners.in_images import resect_from_corners
 from colmap_av1.poses.posed_images import PosedImages, PosesResult
@@ -116,7 +116,7 @@ def test_links_join_images_across_a_gap_in_the_tracks(
     tracks = seen.keep_observations(((number % 2 == 0) & ~later) | ((number % 4 == 1) & later))
     links = seen.keep_observations((number % 4 == 3) & (np.abs(seen.frame - joint) <= 3))
     write_posed_model(tmp_path / "registered.npz", PosedModel(registered.cameras, images))
-    options = ReconstructOptions(mapping=MapperOptions(refine_intrinsics=False))
+    options = ReconstructOptions(poses=PoseOptions(refine_intrinsics=False))
     run = SimpleNamespace(
         options=options,
         stages=tmp_path,

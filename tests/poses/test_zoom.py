@@ -24,8 +24,8 @@ from colmap_av1.match import match
 from colmap_av1.options import (
     CameraOptions,
     ImageOptions,
-    MapperOptions,
     MatchOptions,
+    PoseOptions,
     ReconstructOptions,
 )
 from colmap_av1.poses.zoom import with_own_cameras
@@ -139,4 +139,4 @@ def test_given_intrinsics_are_kept(tmp_path: Path) -> None:
 def test_cameras_per_image_need_the_adjustment() -> None:
     match = MatchOptions(camera=CameraOptions(single_camera=False))
     with pytest.raises(OptionError, match="--adjust 0"):
-        ReconstructOptions(match=match, mapping=MapperOptions(adjust=False))
+        ReconstructOptions(match=match, poses=PoseOptions(adjust=False))

@@ -11,8 +11,8 @@ import pytest
 
 from colmap_av1.options import (
     ImageOptions,
-    MapperOptions,
     MatchOptions,
+    PoseOptions,
     ReconstructOptions,
     TriangulateOptions,
 )
@@ -24,7 +24,7 @@ EVERY = 3
 NUM_IMAGES = 20
 OPTIONS = ReconstructOptions(
     match=MatchOptions(images=ImageOptions(every=EVERY)),
-    mapping=MapperOptions(pose_tracks_per_image=300, pose_spacing=24.0),
+    poses=PoseOptions(pose_tracks_per_image=300, pose_spacing=24.0),
     triangulate=TriangulateOptions(points="survey"),
 )
 
