@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from colmap_av1.batch.run import BatchReport, run_batch
     from colmap_av1.check.database import DatabaseCheck, check_database
     from colmap_av1.check.model import ModelCheck, check_model
+    from colmap_av1.compare import compare
     from colmap_av1.densify import DensifyReport, densify
     from colmap_av1.errors import (
         BitstreamError,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
         VideoError,
         WriteError,
     )
+    from colmap_av1.evaluate.report.results import CompareReport
     from colmap_av1.interop.hloc import HlocMatches, export_hloc, read_hloc
     from colmap_av1.map import MapReport, map_database
     from colmap_av1.match import MatchReport, match
@@ -77,6 +79,7 @@ __all__ = [
     "CameraOptions",
     "ColmapAv1Error",
     "CompareOptions",
+    "CompareReport",
     "DatabaseCheck",
     "DatabaseError",
     "DensifyOptions",
@@ -124,6 +127,7 @@ __all__ = [
     "build_tracks",
     "check_database",
     "check_model",
+    "compare",
     "densify",
     "encode",
     "export_hloc",
@@ -141,6 +145,7 @@ __all__ = [
 # Modules of the public names, except errors and options.
 _MODULES = {
     "BatchReport": "batch.run",
+    "CompareReport": "evaluate.report.results",
     "DatabaseCheck": "check.database",
     "DensifyReport": "densify",
     "EncodeReport": "video.encode",
@@ -156,6 +161,7 @@ _MODULES = {
     "build_tracks": "tracks.tracks",
     "check_database": "check.database",
     "check_model": "check.model",
+    "compare": "compare",
     "densify": "densify",
     "encode": "video.encode",
     "export_hloc": "interop.hloc",

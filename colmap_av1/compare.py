@@ -105,6 +105,14 @@ def compare(
         WriteError: the output cannot be written.
         OptionError: a front-end is unknown, or the folder has other content.
         EvaluationError: a package is missing that the report, a front-end or the trainer needs.
+
+    Examples:
+        >>> from colmap_av1 import CompareOptions, ImageOptions, MatchOptions, compare
+        >>> match = MatchOptions(images=ImageOptions(every=6))
+        >>> options = CompareOptions(match=match, frontends=("av1",), all_tracks=False)
+        >>> report = compare("video.mp4", "my_comparison", options=options)
+        >>> report.columns[0].name, report.columns[0].model.num_registered
+        ('av1', 10)
     """
     output = Path(output)
     write_report = _report_writer()

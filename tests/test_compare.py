@@ -16,7 +16,7 @@ import pycolmap
 import pytest
 from conftest import AV1, PROJECT
 
-from colmap_av1 import compare as compare_module
+import colmap_av1
 from colmap_av1.cli import main
 from colmap_av1.compare import compare
 from colmap_av1.errors import EvaluationError, ImageError, ModelError, OptionError
@@ -261,7 +261,7 @@ def test_interrupted_run_is_resumed(compared, video, truth, tmp_path, monkeypatc
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(compare_module, "measure_mapper", stop)
+        patch.setattr(sys.modules[compare.__module__], "measure_mapper", stop)
         with pytest.raises(KeyboardInterrupt):
             run_again(video, output, truth)
     assert times(output) == kept
@@ -389,7 +389,7 @@ def test_failed_training_has_its_own_exit_status(video, tmp_path, monkeypatch, c
     good = Column("sift", model=model)
     for columns, status in (((good, failed), 3), ((good,), 0)):
         report = SimpleNamespace(columns=columns, warnings=(), output=tmp_path, num_images=2)
-        monkeypatch.setattr(compare_module, "compare", lambda *_, found=report, **__: found)
+        monkeypatch.setattr(colmap_av1, "compare", lambda *_, found=report, **__: found)
         words = ["compare", "--video", str(video), "--output", str(tmp_path), "--quiet"]
         assert main(words) == status
     out, err = capsys.readouterr()

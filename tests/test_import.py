@@ -34,8 +34,9 @@ def test_import_loads_no_libraries_and_has_no_side_effects(tmp_path: Path) -> No
 def test_modules_do_not_hide_functions_of_the_same_name(tmp_path: Path) -> None:
     run = run_python(
         "import colmap_av1.match, colmap_av1.check.database, colmap_av1.densify\n"
-        "from colmap_av1 import check_database, densify, match\n"
-        "assert all(callable(f) for f in (check_database, densify, match, colmap_av1.match))",
+        "import colmap_av1.compare\n"
+        "from colmap_av1 import check_database, compare, densify, match\n"
+        "assert all(map(callable, (check_database, compare, densify, match, colmap_av1.match)))",
         tmp_path,
     )
     assert run.stderr == ""

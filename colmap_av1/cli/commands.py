@@ -220,10 +220,8 @@ def _densify(namespace: argparse.Namespace) -> None:
 
 
 def _compare(namespace: argparse.Namespace) -> int:
-    from colmap_av1.compare import compare
-
     with progress_bars(namespace.quiet) as progress:
-        result = compare(
+        result = colmap_av1.compare(
             namespace.video,
             namespace.output,
             image_path=namespace.image_path,
@@ -260,11 +258,11 @@ def _info(namespace: argparse.Namespace) -> None:
     options = given(namespace, ReadOptions)
     read_out = None
     with progress_bars(namespace.quiet) as progress:
-        result = colmap_av1.read_info(namespace.video, options, progress)
+        result = colmap_av1.read_info(namespace.video, options=options, progress=progress)
         if namespace.rolling_shutter == "estimate":
             from colmap_av1.matching.shutter.of_video import estimate_video_read_out
 
-            read_out = estimate_video_read_out(namespace.video, options, progress)
+            read_out = estimate_video_read_out(namespace.video, options=options, progress=progress)
     # A text says why it is not observable.
     found = read_out if read_out is None or isinstance(read_out, str) else asdict(read_out)
     write_report_json(namespace, result, read_out=found)
@@ -304,8 +302,8 @@ def _motion(namespace: argparse.Namespace) -> None:
         count = colmap_av1.export_motion(
             namespace.video,
             namespace.output,
-            given(namespace, ReadOptions),
-            progress,
+            options=given(namespace, ReadOptions),
+            progress=progress,
             overwrite=namespace.overwrite,
         )
     print_result(namespace, [("coded frames", str(count)), ("output", namespace.output)])
@@ -316,8 +314,8 @@ def _export(namespace: argparse.Namespace) -> None:
         num_images, num_pairs = colmap_av1.export_hloc(
             namespace.database,
             namespace.output,
-            given(namespace, ExportOptions),
-            progress,
+            options=given(namespace, ExportOptions),
+            progress=progress,
             overwrite=namespace.overwrite,
         )
     rows = [("images", str(num_images)), ("pairs", str(num_pairs))]

@@ -67,9 +67,9 @@ class HlocMatches:
 def export_hloc(
     database: str | os.PathLike[str],
     output: str | os.PathLike[str],
+    *,
     options: ExportOptions = ExportOptions(),
     progress: Progress = no_progress,
-    *,
     overwrite: bool = False,
 ) -> tuple[int, int]:
     """Export keypoints and matches of a COLMAP database to hloc's files.

@@ -94,6 +94,7 @@ class StreamReport:
 
 def read_info(
     video: str | os.PathLike[str],
+    *,
     options: ReadOptions = ReadOptions(),
     progress: Progress = no_progress,
 ) -> StreamReport:

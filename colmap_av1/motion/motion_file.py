@@ -28,9 +28,9 @@ _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 def export_motion(
     video: str | os.PathLike[str],
     output: str | os.PathLike[str],
+    *,
     options: ReadOptions = ReadOptions(),
     progress: Progress = no_progress,
-    *,
     overwrite: bool = False,
 ) -> int:
     """Write the motion of every coded frame to a .npz or .h5 file.

@@ -130,7 +130,9 @@ def open_source(
     """
     # A killed run may have left its stream here, even if this video needs no conversion.
     remove_leftovers(next_to.resolve().parent, next_to.resolve().name)
-    if video.codec == "av1" and not (options.reencode and read_info(video, options.read).reasons):
+    if video.codec == "av1" and not (
+        options.reencode and read_info(video, options=options.read).reasons
+    ):
         yield VideoSource(video, video)
         return
     strict = options.read.strict

@@ -56,8 +56,8 @@ def test_export_and_import_are_inverse(tmp_path: Path, layout: str, verified: bo
     counts = export_hloc(
         path,
         tmp_path / "to" / "hloc",
-        ExportOptions(verified=verified),
-        lambda *progress: seen.append(progress),
+        options=ExportOptions(verified=verified),
+        progress=lambda *progress: seen.append(progress),
     )
     assert counts == (len(NAMES), len(THEIRS.pairs))
     assert seen[-1] == ("pairs", counts[1], counts[1])

@@ -36,6 +36,7 @@ class VideoReadOut:
 
 def estimate_video_read_out(
     video: str | os.PathLike[str],
+    *,
     options: ReadOptions = ReadOptions(),
     progress: Progress = no_progress,
 ) -> VideoReadOut | str:
