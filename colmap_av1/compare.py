@@ -20,7 +20,13 @@ from colmap_av1.evaluate.frontends.registry import make_frontends
 from colmap_av1.evaluate.metrics.clouds import cloud_distances
 from colmap_av1.evaluate.metrics.poses import fit_similarity, image_poses, pose_errors, read_poses
 from colmap_av1.evaluate.programs import check_packages
-from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
+from colmap_av1.evaluate.report.results import (
+    ALL_TRACKS,
+    BASELINES,
+    Cloud,
+    Column,
+    CompareReport,
+)
 from colmap_av1.evaluate.training.trainers import check_trainer, train, write_split
 from colmap_av1.geometry.alignment import transform_poses
 from colmap_av1.geometry.colmap_model import point_colours, point_positions, read_model
@@ -34,13 +40,9 @@ from colmap_av1.util.stages import open_stages, writing_stages
 from colmap_av1.video.facts import read_video
 from colmap_av1.video.metadata.spherical import check_is_plane
 
-# Without a given reference, the model of this front-end is the pseudo truth.
-PSEUDO_TRUTH = "sift-exhaustive"
-# If only poses are given, the cloud of the first of these front-ends is the reference cloud whose
-# ATE is at most this share of the path's extent.
-_PSEUDO_TRUTHS = (PSEUDO_TRUTH, "sift-sequential")
+# If only poses are given, the cloud of the first baseline is the reference cloud whose ATE is at
+# most this share of the path's extent.
 _LARGEST_ATE = 0.02
-ALL_TRACKS = " + all tracks"
 _OWN = "av1"
 # Folder in the output for the results of the front-ends.
 _FRONTENDS = "frontends"
@@ -350,7 +352,7 @@ def _with_pseudo_truth(given: _Reference, columns: list[Column], footage: Footag
     """
     if given.points is not None:
         return given
-    for name in _PSEUDO_TRUTHS if given.poses is not None else (PSEUDO_TRUTH,):
+    for name in BASELINES if given.poses is not None else BASELINES[:1]:
         column = next((c for c in columns if c.name == name), None)
         if column is None or column.model_path is None:
             continue

@@ -13,7 +13,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from colmap_av1.evaluate.report.results import Cloud, Column, CompareReport
+from colmap_av1.evaluate.report.results import ALL_TRACKS, Cloud, Column, CompareReport
 from colmap_av1.geometry.colmap_model import camera_centres
 from colmap_av1.geometry.observable import framed_box
 from colmap_av1.util.arrays import Bools, Floats, Ints, Picture
@@ -149,7 +149,7 @@ def length_chart(columns: Sequence[Column]) -> bytes:
             lengths = np.array(sorted(column.track_lengths))
             counts = np.array([column.track_lengths[int(n)] for n in lengths])
             at_least = counts[::-1].cumsum()[::-1]
-            dashes = "--" if column.name.endswith("all tracks") else "-"
+            dashes = "--" if column.name.endswith(ALL_TRACKS) else "-"
             axis.step(
                 lengths,
                 at_least,

@@ -15,6 +15,12 @@ from colmap_av1.evaluate.metrics.poses import PoseErrors
 from colmap_av1.evaluate.training.trainers import Training
 from colmap_av1.util.arrays import Bools, Floats
 
+# The front-ends that others are compared with, the preferred one first. Without a given reference,
+# the model of the first is the pseudo truth.
+BASELINES = ("sift-exhaustive", "sift-sequential")
+# End of the name of a column with all tracks.
+ALL_TRACKS = " + all tracks"
+
 
 @dataclass(frozen=True)
 class Column:

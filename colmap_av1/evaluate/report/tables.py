@@ -8,12 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_av1.evaluate.report.results import Column, CompareReport
+from colmap_av1.evaluate.report.results import BASELINES, Column, CompareReport
 from colmap_av1.evaluate.training.splatting import Milestone, quality_after, share_of_time
 
-# The front-end that others are compared with; for trainings, the first of these that was trained.
-BASELINE = "sift-exhaustive"
-_TRAINING_BASELINES = (BASELINE, "sift-sequential")
 _QUALITIES = {"psnr_y": ".2f", "ssim_db": ".2f", "vmaf": ".1f"}
 _NONE = "-"
 _LENGTH_CLASSES = (2, 3, 5, 9, 17, 33)
@@ -31,7 +28,7 @@ class Table:
 
 def models_table(report: CompareReport) -> Table:
     """Points, errors, poses and clouds of each model."""
-    base = next((c.model for c in report.columns if c.name == BASELINE), None)
+    base = next((c.model for c in report.columns if c.name == BASELINES[0]), None)
     header = ["front-end", "images", "points"]
     header += ["x SIFT exhaustive"] * (base is not None)
     header += ["coverage", "track length", "error px, mean / median"]
@@ -220,9 +217,9 @@ def renderings_table(columns: Sequence[Column]) -> Table:
 
 
 def _training_baseline(columns: Sequence[Column]) -> tuple[str, Sequence[Milestone]]:
-    """Name and milestones of the training that others are compared with; empty without one."""
+    """Name and milestones of the first baseline that was trained; empty without one."""
     trained = {column.name: column.training.states for column in columns if column.training}
-    name = next((name for name in _TRAINING_BASELINES if name in trained), "")
+    name = next((name for name in BASELINES if name in trained), "")
     return name, trained.get(name, ())
 
 
