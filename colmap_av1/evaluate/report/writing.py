@@ -43,16 +43,30 @@ from colmap_av1.util.plain import json_text
 
 @dataclass(frozen=True)
 class _Figure:
-    """A picture; the suffix of its name determines the file format."""
+    """A picture of the page.
 
-    name: str
+    Attributes:
+        caption: the text below it.
+        content: the encoded picture.
+        mime: the media type of its format.
+    """
+
     caption: str
     content: bytes
+    mime: str
 
     @property
     def uri(self) -> str:
-        kind = {".svg": "image/svg+xml", ".png": "image/png"}[Path(self.name).suffix]
-        return f"data:{kind};base64,{base64.b64encode(self.content).decode()}"
+        return f"data:{self.mime};base64,{base64.b64encode(self.content).decode()}"
+
+
+def _svg(caption: str, content: bytes) -> _Figure:
+    return _Figure(caption, content, "image/svg+xml")
+
+
+def _png(caption: str, picture: NDArray[np.uint8]) -> _Figure:
+    _, encoded = cv2.imencode(".png", picture)
+    return _Figure(caption, encoded.tobytes(), "image/png")
 
 
 def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Footage) -> None:
@@ -66,16 +80,16 @@ def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Fo
     Raises:
         OSError: a file cannot be written.
     """
-    figures = {
-        "bars": [_Figure("figures.svg", "Main figures", bar_charts(report))],
-        "clouds": _cloud_figures(report, clouds, footage),
-        "lengths": [_Figure("track_lengths.svg", "Track lengths", length_chart(report.columns))],
-        "cost": [_Figure("cpu_time.svg", "CPU time", cost_chart(report.columns))],
+    charts = {
+        "bars": [_svg("Main figures", bar_charts(report))],
+        "lengths": [_svg("Track lengths", length_chart(report.columns))],
+        "cost": [_svg("CPU time", cost_chart(report.columns))],
     }
     curves = training_chart(report.columns)
     if curves is not None:
-        figures["training"] = [_Figure("training.svg", "Renderings over time", curves)]
-    figures["crops"] = _crop_figures(report.columns)
+        charts["training"] = [_svg("Renderings over time", curves)]
+    grids = _cloud_figures(report, clouds, footage)
+    grids["crop"] = _crop_figures(report.columns)
     tables = {"models": models_table(report)}
     if report.pose_reference or report.cloud_reference:
         tables["published"] = published_table(report)
@@ -86,7 +100,8 @@ def write_report(report: CompareReport, clouds: Mapping[str, Cloud], footage: Fo
     milestones = milestones_table(report.columns)
     if milestones is not None:
         tables["milestones"] = milestones
-    _write(report.output / "report.html", _html(report, tables, figures).encode("utf-8", "replace"))
+    page = _html(report, tables, charts, grids)
+    _write(report.output / "report.html", page.encode("utf-8", "replace"))
     _write(report.output / "results.json", _json(report).encode())
 
 
@@ -120,61 +135,49 @@ def _crop_figures(columns: Sequence[Column]) -> list[_Figure]:
     first = trained[0][1]
     reference = read_image(first.references[first.names.index(name)])
     rows, cols = crop_window(reference)
-    figures = [_crop("photograph", f"{name}, photograph", reference[rows, cols])]
+    figures = [_png(f"{name}, photograph", reference[rows, cols])]
     for column, training in trained:
         i = training.names.index(name)
-        label = (
+        caption = (
             f"{column}: {training.metrics.psnr_y[i]:.2f} dB, VMAF {training.metrics.vmaf[i]:.1f}"
         )
-        figures.append(
-            _crop(column.replace(" ", ""), label, read_image(training.renders[i])[rows, cols])
-        )
+        figures.append(_png(caption, read_image(training.renders[i])[rows, cols]))
     return figures
-
-
-def _crop(name: str, caption: str, picture: NDArray[np.uint8]) -> _Figure:
-    _, encoded = cv2.imencode(".png", picture)
-    return _Figure(f"{name}_crop.png", caption, encoded.tobytes())
 
 
 def _cloud_figures(
     report: CompareReport, clouds: Mapping[str, Cloud], footage: Footage
-) -> list[_Figure]:
-    """Each cloud from two viewpoints, which are the same for all aligned clouds."""
-    like = clouds.get(report.cloud_reference) or next(
+) -> dict[str, list[_Figure]]:
+    """Each cloud from two viewpoints, "view" and "plan"; the same for all aligned clouds."""
+    reference = clouds.get(report.cloud_reference) or next(
         (cloud for cloud in clouds.values() if cloud.is_aligned), None
     )
-    figures = []
+    figures: dict[str, list[_Figure]] = {"view": [], "plan": []}
     for column in report.columns:
         cloud = clouds.get(column.name)
         if cloud is None:
             continue
-        model = like if like is not None and cloud.is_aligned else cloud
-        drawn = {
-            "view": draw_perspective(cloud, view_of(model), footage.size),
-            "plan": draw_plan(cloud, model, (640, 480)),
-        }
-        label = f"{column.name}: {len(cloud.points):,} points"
-        if like is not None and not cloud.is_aligned:
-            label += ", in its own coordinates"
-        for kind, picture in drawn.items():
-            _, encoded = cv2.imencode(".png", picture)
-            name = f"{column.name.replace(' ', '')}_{kind}.png"
-            seen = {"view": "", "plan": ", from above"}[kind]
-            figures.append(_Figure(name, f"{label}{seen}", encoded.tobytes()))
+        framed = reference if reference is not None and cloud.is_aligned else cloud
+        caption = f"{column.name}: {len(cloud.points):,} points"
+        if reference is not None and not cloud.is_aligned:
+            caption += ", in its own coordinates"
+        view = draw_perspective(cloud, view_of(framed), footage.size)
+        figures["view"].append(_png(caption, view))
+        plan = draw_plan(cloud, framed, (640, 480))
+        figures["plan"].append(_png(f"{caption}, from above", plan))
     return figures
 
 
 def _facts(report: CompareReport) -> str:
     known = "intrinsics given and fixed" if report.fixed_intrinsics else "intrinsics estimated"
-    label = (
+    facts = (
         f"{report.num_images} images of {report.num_frames} frames, "
         f"{report.size[0]}x{report.size[1]}; {known}; COLMAP's incremental mapper with the same "
         "settings for every front-end"
     )
     if report.forward_motion:
-        label += ", which may initialize with pairs of forward motion"
-    return f"{label}."
+        facts += ", which may initialize with pairs of forward motion"
+    return f"{facts}."
 
 
 def _notes(report: CompareReport) -> list[str]:
@@ -199,20 +202,20 @@ def _notes(report: CompareReport) -> list[str]:
 
 
 def _html(
-    report: CompareReport, tables: Mapping[str, Table], figures: Mapping[str, list[_Figure]]
+    report: CompareReport,
+    tables: Mapping[str, Table],
+    charts: Mapping[str, list[_Figure]],
+    grids: Mapping[str, list[_Figure]],
 ) -> str:
-    pictures = [*figures["clouds"], *figures["crops"]]
+    """The page, with charts and grids of pictures by the names that its template uses."""
     return render_page(
         "compare.html",
         video=report.video.name,
         facts=_facts(report),
         notes=_notes(report),
         tables=tables,
-        charts=figures,
-        grids={
-            kind: [figure for figure in pictures if figure.name.endswith(f"_{kind}.png")]
-            for kind in ("view", "plan", "crop")
-        },
+        charts=charts,
+        grids=grids,
         is_upright=report.size[1] > report.size[0],
         versions=_versions(),
     )
