@@ -88,7 +88,6 @@ ALL_TRACKS = {
 class Row:
     """Figures of one front-end; None if not measured."""
 
-    frontend: str
     run: FrontendRun
     statistics: TrackStatistics
     epipolar: dict[int, float] | None
@@ -182,7 +181,6 @@ def measure_case(
                 footage if name not in FROM_SOURCE else source_footage(footage, material, folder)
             )
             run = measure_frontend(FROM_SOURCE.get(name, name), given, folder / name)
-            run = replace(run, name=name)
             mapper = dense = None
             if mapping:
                 where = folder / f"{name}-model"
@@ -242,7 +240,6 @@ def measure_row(
         if truth.poses is not None:
             errors = pose_errors(model_poses(model, material.num_frames), truth.poses)
     return Row(
-        frontend=run.name,
         run=run,
         statistics=track_statistics(tracks, np.array(footage.frames)),
         epipolar=epipolar,

@@ -38,7 +38,6 @@ class FrontendRun:
     """A database and the cost of filling it.
 
     Attributes:
-        name: the front-end.
         database: the COLMAP database.
         seconds: wall time of each stage.
         warnings: warnings for the user.
@@ -46,7 +45,6 @@ class FrontendRun:
         peak_memory: largest resident memory in bytes; None if the system does not report it.
     """
 
-    name: str
     database: Path
     seconds: dict[str, float]
     warnings: tuple[str, ...]
@@ -104,7 +102,6 @@ def run_frontend(name: str, footage: Footage, folder: Path, frontend: Frontend) 
         timed=True,
     ).result
     return FrontendRun(
-        name,
         database,
         seconds=made.result.seconds,
         warnings=made.result.warnings,
