@@ -66,7 +66,7 @@ class DensifyReport:
         num_images: images of the model.
         masked: share of the images' pixels that masks exclude; None without masks.
         num_tracks: tracks of the video with enough observations.
-        agreeing: share of these that agree with the poses.
+        agreement: share of these that agree with the poses.
         num_points: 3D points.
         num_model_points: 3D points of the given model.
         coverage: share of the images' cells of 16x16 pixels that visible points project into.
@@ -83,7 +83,7 @@ class DensifyReport:
     num_images: int
     masked: float | None
     num_tracks: int
-    agreeing: float
+    agreement: float
     num_points: int
     num_model_points: int
     coverage: float
@@ -209,7 +209,7 @@ def densify(
         num_images=len(images),
         masked=image_set.masked,
         num_tracks=triangulated.points.num_tracks,
-        agreeing=triangulated.agreement,
+        agreement=triangulated.agreement,
         num_points=len(cloud.xyz),
         num_model_points=reconstruction.num_points3D(),
         coverage=covered,

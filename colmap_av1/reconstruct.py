@@ -451,9 +451,9 @@ def _warnings(
         warnings.append(estimate.long_range.result.warning)
     if estimate.adjustment is not None and estimate.adjustment.result.seams_warning is not None:
         warnings.append(estimate.adjustment.result.seams_warning)
-    if model.agreeing < LEAST_AGREEING:
+    if model.agreement < LEAST_AGREEING:
         warnings.append(
-            f"only {model.agreeing:.0%} of the tracks agree with the poses, which may be wrong: "
+            f"only {model.agreement:.0%} of the tracks agree with the poses, which may be wrong: "
             "try the other --mapper, or give --camera_params"
         )
     return warnings

@@ -41,7 +41,7 @@ def dense(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> pycolmap.Re
     report = densify(model, SCENE, folder / "dense", options=options)
     made = pycolmap.Reconstruction(folder / "dense")
     assert report.num_images == 60
-    assert report.agreeing > 0.9
+    assert report.agreement > 0.9
     assert report.num_points == made.num_points3D()
     assert sorted(made.images) == sorted(pycolmap.Reconstruction(model).images)
     return made

@@ -391,7 +391,7 @@ def test_reconstruct_joins_videos_and_photos_in_one_model(
     write_model(posed, adjusted.cameras, adjusted.images, ModelPoints.empty())
     dense = densify(posed, halves, tmp_path / "dense", photos=photos)
     assert dense.num_images == made.num_images
-    assert dense.agreeing > 0.9
+    assert dense.agreement > 0.9
     with pytest.raises(ModelError, match="photos/"):
         densify(posed, halves, tmp_path / "none")
 

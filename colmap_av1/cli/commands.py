@@ -7,6 +7,7 @@ fast.
 from __future__ import annotations
 
 import argparse
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -19,7 +20,8 @@ from colmap_av1.cli.options import add_options, given
 from colmap_av1.cli.parser import Parser
 from colmap_av1.cli.report_file import write_report_json
 from colmap_av1.cli.terminal import (
-    print_next,
+    as_shown,
+    print_note,
     print_result,
     print_text,
     print_warning,
@@ -151,7 +153,22 @@ def _match(namespace: argparse.Namespace) -> None:
     write_report_json(namespace, result)
     print_result(namespace, reports.match_rows(result), result.warnings)
     if not namespace.quiet:
-        print_next(result)
+        _print_next(result)
+
+
+def _print_next(report: colmap_av1.MatchReport) -> None:
+    """Print the commands that map what `match` wrote."""
+    with_colmap, with_ours, densify = map(as_shown, report.next_commands)
+    if sys.stdout.isatty():
+        # Printed without markup, so that they can be copied from any terminal.
+        print_text(
+            f"Map it with COLMAP:\n  {with_colmap}\nor without it:\n  {with_ours}\n"
+            f"Then, to train Gaussian splats:\n  {densify}\n"
+        )
+    else:
+        print_text(f"next\t{with_colmap}\nor\t{with_ours}\nthen, for splats\t{densify}\n")
+    if report.image_path is None:
+        print_note("IMAGES stands for a folder of the frames")
 
 
 def _map(namespace: argparse.Namespace) -> None:

@@ -243,7 +243,7 @@ def densify_rows(report: DensifyReport) -> Rows:
         *_conversion_row(report.conversion),
         ("images", str(report.num_images)),
         *_mask_row(report.masked),
-        ("tracks", f"{report.num_tracks}, {report.agreeing:.1%} agree with the poses"),
+        ("tracks", f"{report.num_tracks}, {report.agreement:.1%} agree with the poses"),
         ("points", f"{report.num_points}, {report.num_model_points} in the given model"),
         (
             "coverage",

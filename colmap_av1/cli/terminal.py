@@ -17,7 +17,6 @@ from colmap_av1.util.remote import without_secrets
 from colmap_av1.util.texts import on_one_line
 
 if TYPE_CHECKING:
-    from colmap_av1.match import MatchReport
     from colmap_av1.util.progress import Progress
 
 PROGRAM = "colmap-av1"
@@ -42,7 +41,8 @@ def renamed(text: str) -> str:
     return text
 
 
-def _as_shown(text: str) -> str:
+def as_shown(text: str) -> str:
+    """The text on one line, with the names of `show_as`."""
     return on_one_line(renamed(text))
 
 
@@ -78,7 +78,7 @@ def progress_bars(quiet: bool) -> Iterator[Progress]:
 
 def print_summary(rows: Rows) -> None:
     """Print rows as a table on a terminal, and otherwise as lines of name, tab and value."""
-    rows = [(_as_shown(name), _as_shown(value)) for name, value in rows]
+    rows = [(as_shown(name), as_shown(value)) for name, value in rows]
     if not sys.stdout.isatty():
         print_text("".join(f"{name}\t{value}\n" for name, value in rows))
         return
@@ -99,21 +99,6 @@ def print_result(namespace: Namespace, rows: Rows, warnings: Sequence[str] = ())
         print_warning(warning)
     if not namespace.quiet:
         print_summary(rows)
-
-
-def print_next(report: MatchReport) -> None:
-    """Print the commands that map what `match` wrote."""
-    with_colmap, with_ours, densify = map(_as_shown, report.next_commands)
-    if sys.stdout.isatty():
-        # Printed without markup, so that they can be copied from any terminal.
-        print_text(
-            f"Map it with COLMAP:\n  {with_colmap}\nor without it:\n  {with_ours}\n"
-            f"Then, to train Gaussian splats:\n  {densify}\n"
-        )
-    else:
-        print_text(f"next\t{with_colmap}\nor\t{with_ours}\nthen, for splats\t{densify}\n")
-    if report.image_path is None:
-        print_note("IMAGES stands for a folder of the frames")
 
 
 def print_text(text: str) -> None:
@@ -154,7 +139,7 @@ def print_error(message: object) -> None:
 def _print_line(text: str) -> None:
     try:
         # File names may contain any character.
-        print(_as_shown(without_secrets(text)), file=sys.stderr, flush=True)
+        print(as_shown(without_secrets(text)), file=sys.stderr, flush=True)
     except OSError:  # nowhere left to report it
         _silence(sys.stderr)
 

@@ -21,7 +21,7 @@ from colmap_av1.util.digests import file_digest
 from colmap_av1.video.facts import Video, count_shown, read_video
 from colmap_av1.video.metadata.lens import implausible_focal_length
 from colmap_av1.video.metadata.positions import implausible_position
-from colmap_av1.video.metadata.spherical import check_is_plane, hint
+from colmap_av1.video.metadata.spherical import check_is_plane, spherical_warnings
 from colmap_av1.video.unchanged import FileState
 
 _Path = str | os.PathLike[str]
@@ -184,13 +184,15 @@ def read_inputs(
     _check_one_camera(videos, found, options.camera)
     of_videos = tuple(labels[: len(videos)]) if len(videos) > 1 else ("",)
     _check_lengths(videos, of_videos)
-    hints = [words for v in videos for words in hint(v.path, v.projection, v.picture_size)]
+    spherical = [
+        text for v in videos for text in spherical_warnings(v.path, v.projection, v.picture_size)
+    ]
     doubtful = [
         (v.doubtful_times, implausible_position(v.tags), implausible_focal_length(v.tags))
         for v in videos
     ]
     doubts = _with_names(videos, [[note for note in own if note is not None] for own in doubtful])
-    notes = (*hints, *doubts, *((warning,) if warning is not None else ()))
+    notes = (*spherical, *doubts, *((warning,) if warning is not None else ()))
     inputs = Inputs(videos, of_videos, tuple(found), None, notes)
     if options.masks.mask_path is None:
         return inputs

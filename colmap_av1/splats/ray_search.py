@@ -77,15 +77,15 @@ class Grey:
         return (xy / self.factor).astype(np.float32)
 
 
-def shrinking(size: tuple[int, int]) -> int:
+def reduction_factor(size: tuple[int, int]) -> int:
     """The factor by which pictures of a (width, height) are reduced."""
     return math.ceil(math.sqrt(math.prod(size) / _MOST_PIXELS))
 
 
-def smaller(picture: NDArray[np.uint8]) -> Grey:
+def reduced_grey(picture: NDArray[np.uint8]) -> Grey:
     """Convert a picture, uint8 [height, width, 3] BGR, to a reduced grey picture."""
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    factor = shrinking(grey.shape[::-1])
+    factor = reduction_factor(grey.shape[::-1])
     height, width = (length // factor for length in grey.shape)
     # Crop to a multiple of the factor; cv2.resize would otherwise scale by a different factor.
     grey = np.ascontiguousarray(grey[: height * factor, : width * factor])

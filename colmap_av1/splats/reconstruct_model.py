@@ -103,7 +103,7 @@ def _undistorted(picture: Picture, how: Undistortion | None) -> Picture:
     return how(picture) if how is not None else picture
 
 
-def _written_images(
+def _write_images(
     run: Run,
     folder: Path,
     registered: PosedImages,
@@ -165,7 +165,7 @@ def _written_cloud(
 
     def show(look: Look) -> None:
         with clock.measure("images"):
-            _written_images(run, folder, registered, undistort, look)
+            _write_images(run, folder, registered, undistort, look)
 
     if options.points == "survey":
         show(lambda *_: None)
@@ -236,7 +236,7 @@ class ModelResult:
         mean_error: mean reprojection error of the points in pixels.
         focal_lengths: the shortest and the longest of the cameras in pixels.
         undistorted: whether images were undistorted, so that they differ from the pictures.
-        agreeing: share of the tracks that agree with the poses.
+        agreement: share of the tracks that agree with the poses.
     """
 
     num_points: int
@@ -245,7 +245,7 @@ class ModelResult:
     mean_error: float
     focal_lengths: tuple[float, float]
     undistorted: bool
-    agreeing: float
+    agreement: float
 
 
 def model_stage(
@@ -276,7 +276,7 @@ def model_stage(
         valid = undistorted_masks(joined, registered.camera_of_image, cameras)
         views = views_of(images, cameras, valid)
         with clock.measure("points"):
-            tracked, agreeing = _tracked_points(run, registered, views, tracks)
+            tracked, agreement = _tracked_points(run, registered, views, tracks)
             shows_dynamic = np.array([image.name in dynamic_masks for image in images])
             tracked = tracked.take(static_points(tracked, shows_dynamic))
         undistort = _undistortions(registered, cameras)
@@ -304,7 +304,7 @@ def model_stage(
             focal_lengths=(min(focal), max(focal)),
             undistorted=options.undistort
             and not all(map(is_undistorted, registered.cameras.values())),
-            agreeing=agreeing,
+            agreement=agreement,
         )
 
     how = (options.triangulate, options.match.images.file_name, options.moving, options.undistort)

@@ -18,7 +18,14 @@ from colmap_av1.geometry.coverage import CELL, nearest_in_cells, squares_of_cell
 from colmap_av1.geometry.masks import make_mask
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_camera import PosedCamera
-from colmap_av1.splats.ray_search import LEAST_OTHERS, Grey, Swept, shrinking, smaller, sweep_image
+from colmap_av1.splats.ray_search import (
+    LEAST_OTHERS,
+    Grey,
+    Swept,
+    reduced_grey,
+    reduction_factor,
+    sweep_image,
+)
 from colmap_av1.util.arrays import Bools, Floats
 from colmap_av1.util.grouping import groups
 from colmap_av1.util.spread import evenly_spread
@@ -99,7 +106,7 @@ class Sweep:
         Pictures must be added in ascending order of images; missing pictures are skipped.
         """
         if image in self._needed:
-            self._greys[image] = smaller(picture)
+            self._greys[image] = reduced_grey(picture)
         while self._left and max([self._left[0], *self._others[self._left[0]]]) <= image:
             self._look(self._left.pop(0))
         first = min((min([key, *self._others[key]]) for key in self._left), default=image + 1)
@@ -156,7 +163,7 @@ def _others(
         return 0 <= key + steps < len(views) and sequence[key + steps] == sequence[key]
 
     def motion(image: int) -> float:
-        focal = views[key].camera.mean_focal_length() / shrinking(views[key].size)
+        focal = views[key].camera.mean_focal_length() / reduction_factor(views[key].size)
         return float(np.linalg.norm(views[image].centre - views[key].centre) * focal / near)
 
     step = 1

@@ -87,7 +87,7 @@ def check_new_file(
     """
     if not os.path.lexists(path):
         return
-    if path.is_dir() or (path.exists() and not path.is_file()):
+    if path.exists() and not path.is_file():
         raise OptionError(f"{path}: exists and is not a file: give another output")
     if any(_is_same(path, given) for given in inputs if given is not None):
         raise OptionError(f"{path}: is the input itself: give another output")

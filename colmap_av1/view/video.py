@@ -100,13 +100,13 @@ def view_video(
         opened = read_video(video, operating_point)
         chained = chained.as_displayed(opened.display, opened.presented)
         drawing = _prepare(chained, options)
-        draw = [d for d in (_draw_motion, _draw_tracks) if options.draw in ("both", _NAMES[d])]
+        panels = [draw for name, draw in _PANELS.items() if options.draw in ("both", name)]
         check_video()
         with open_pictures(path, opened.frame_rate or _DEFAULT_FRAME_RATE) as write:
             for index, picture in decode_frames(opened, operating_point=operating_point):
                 if index >= chained.num_frames:
                     break
-                write(side_by_side([panel(picture, drawing, index) for panel in draw]))
+                write(side_by_side([draw(picture, drawing, index) for draw in panels]))
                 count += 1
                 progress("pictures", count, chained.num_frames)
             check_video()
@@ -211,8 +211,8 @@ def _draw_tracks(picture: Picture, drawing: _Drawing, frame: int) -> Picture:
     return np.asarray(drawn)
 
 
-# The value of ViewOptions.draw for each panel; "both" draws both.
-_NAMES = {_draw_motion: "motion", _draw_tracks: "tracks"}
+# The panels by the values of ViewOptions.draw; "both" draws all of them.
+_PANELS = {"motion": _draw_motion, "tracks": _draw_tracks}
 
 
 def fixed_point(xy: NDArray[np.float32]) -> NDArray[np.int32]:

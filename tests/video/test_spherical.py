@@ -14,7 +14,7 @@ from conftest import Encode, Ffmpeg, make_frames
 from colmap_av1.errors import VideoError
 from colmap_av1.match import match
 from colmap_av1.video.facts import read_video
-from colmap_av1.video.metadata.spherical import hint
+from colmap_av1.video.metadata.spherical import spherical_warnings
 
 # Google's Spherical Video RFC, version 1: XML in a box of this type in the track.
 UUID = bytes.fromhex("ffcc8263f8554a938814587a02521fdd")
@@ -59,8 +59,8 @@ def test_suggested_command_extracts_views(encode: Encode, ffmpeg: Ffmpeg, tmp_pa
 
 def test_aspect_ratio_gives_a_hint() -> None:
     video = Path("a.mp4")
-    (message,) = hint(video, None, (3840, 1920))
+    (message,) = spherical_warnings(video, None, (3840, 1920))
     assert "equirectangular" in message
-    assert hint(video, None, (3840, 2160)) == []
-    assert hint(video, None, (256, 128)) == []
-    assert hint(video, 0, (3840, 1920)) == []
+    assert spherical_warnings(video, None, (3840, 2160)) == []
+    assert spherical_warnings(video, None, (256, 128)) == []
+    assert spherical_warnings(video, 0, (3840, 1920)) == []

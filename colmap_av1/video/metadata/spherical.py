@@ -53,7 +53,7 @@ def check_is_plane(path: Path, projection: int | None, width: int) -> None:
     )
 
 
-def hint(path: Path, projection: int | None, size: tuple[int, int]) -> list[str]:
+def spherical_warnings(path: Path, projection: int | None, size: tuple[int, int]) -> list[str]:
     """A warning if pictures have the shape of equirectangular ones but no such metadata."""
     if projection is not None or size[0] != 2 * size[1] or size[0] < _MIN_WIDTH:
         return []
