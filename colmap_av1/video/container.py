@@ -105,6 +105,16 @@ class VideoFile:
         return str(self.path)
 
     @property
+    def is_mp4(self) -> bool:
+        """Whether the container is MP4 or QuickTime: FFmpeg's format "mov,mp4,m4a,..."."""
+        return _is_mp4(self.container)
+
+    @property
+    def is_matroska(self) -> bool:
+        """Whether the container is Matroska or WebM: FFmpeg's format "matroska,webm"."""
+        return "matroska" in self.container.split(",")
+
+    @property
     def likely_num_packets(self) -> int | None:
         """The number of packets, or an estimate from duration and frame rate."""
         if self.num_packets is not None or self.duration is None or self.frame_rate is None:
@@ -136,7 +146,7 @@ def describe(container: Any, stream: Any, state: FileState) -> VideoFile:
     rate = stream.average_rate or stream.guessed_rate
     is_timed = not (_is_ivf_without_rate(state.path) or _is_mp4_without_scale(container, stream))
     num_packets, duration = stream.frames or None, _stream_duration(container, stream)
-    if num_packets and "mov" in container.format.name and is_fragmented_mp4(state.path):
+    if num_packets and _is_mp4(container.format.name) and is_fragmented_mp4(state.path):
         num_packets = None  # the container counts only those before the fragments
     if container.format.name == "ivf" and is_timed and rate and stream.time_base != 1 / rate:
         # The header holds the number of frames or the duration in time units, depending on the
@@ -249,11 +259,11 @@ def missing_end(file: VideoFile, count: int, last: Any, last_pts: int | None = N
         last_pts: the largest presentation time of all packets in units of the time base, if it may
             be that of another packet; None: that of the last one.
     """
-    if 0 < count < (file.num_packets or 0) and "mp4" in file.container:
+    if 0 < count < (file.num_packets or 0) and file.is_mp4:
         return f"cut off after {count} of {file.num_packets} packets"
     if count == 0:
         # The sample tables point outside the file, or it ends inside the first packet.
-        if file.num_packets or (file.duration and "matroska" in file.container):
+        if file.num_packets or (file.duration and file.is_matroska):
             return "damaged or cut off before the end of the first packet"
         return None
     size = file.path.stat().st_size
@@ -263,12 +273,12 @@ def missing_end(file: VideoFile, count: int, last: Any, last_pts: int | None = N
             return f"cut off after packet {count}"
         if file.container == "obu" and end != size:
             return f"cut off after packet {count}"
-        if "matroska" in file.container and is_matroska_cut(file.path, last.pos, last.size):
+        if file.is_matroska and is_matroska_cut(file.path, last.pos, last.size):
             return f"cut off after packet {count}"
-    if "mp4" in file.container and is_fragmented_mp4_cut(file.path):
+    if file.is_mp4 and is_fragmented_mp4_cut(file.path):
         return f"cut off after packet {count}"
     last_pts = last.pts if last_pts is None else last_pts
-    if "matroska" in file.container and file.duration and last_pts is not None:
+    if file.is_matroska and file.duration and last_pts is not None:
         step = 1 / file.frame_rate if file.frame_rate else 0.0
         length = float((last.duration or 0) * last.time_base)
         end_time = float(last_pts * last.time_base) + max(length, step)
@@ -336,13 +346,17 @@ def _is_ivf_without_rate(path: Path) -> bool:
     return header.startswith(b"DKIF") and b"\0" * 4 in (rate[:4], rate[4:])
 
 
+def _is_mp4(format_name: str) -> bool:
+    return "mp4" in format_name.split(",")
+
+
 def _is_mp4_without_scale(container: Any, stream: Any) -> bool:
     """Whether an MP4 file has an invalid time scale, for which FFmpeg assumes units of a second.
 
     With this unit the file has less than one frame per second, which no real video has.
     """
     rate = stream.average_rate
-    is_second = "mov" in container.format.name.split(",") and stream.time_base == 1
+    is_second = _is_mp4(container.format.name) and stream.time_base == 1
     return bool(is_second and rate is not None and rate < 1)
 
 

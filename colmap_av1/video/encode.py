@@ -191,7 +191,7 @@ def _encode(
             f"{output}: IVF cannot hold the pixel aspect of {path}, without which focal lengths "
             "are wrong: give an output that ends in .mp4, .mkv or .webm"
         )
-    ignores_edits = "mov" in file.container and (
+    ignores_edits = file.is_mp4 and (
         is_for_motion or file.doubtful_times is not None  # an edit list that hides nearly all
     )
     positions, second_input, copied = None, list[str](), list[str]()

@@ -86,7 +86,7 @@ def read_video(video: str | os.PathLike[str], operating_point: int = 0) -> Video
     with open_container(path) as container:
         stream = find_decodable_stream(container, path)
         file = describe(container, stream, state)
-        crop = _container_crop(container, stream.index)
+        crop = _container_crop(container, file)
         aspect = float(stream.sample_aspect_ratio or 1)
         num_entries = len(stream.index_entries)
         frames = decode_stream(container, stream, path, operating_point, 1)
@@ -131,7 +131,7 @@ def _checked_edits(
     file: VideoFile, num_entries: int
 ) -> tuple[NDArray[np.int32] | None, str | None]:
     """`Video.presented` and `Video.doubtful_times` of a file that lists `num_entries` samples."""
-    if "mov" not in file.container:
+    if not file.is_mp4:
         return None, None
     if not file.is_timed:
         return None, (
@@ -225,9 +225,9 @@ def count_shown(video: Video) -> int:
     return counted(video)[0].num_packets or 0
 
 
-def _container_crop(container: Any, stream_index: int) -> tuple[int, int, int, int]:
-    """Pixels that the container crops at the left, top, right and bottom."""
-    if not {"mov", "matroska"} & set(container.format.name.split(",")):
+def _container_crop(container: Any, file: VideoFile) -> tuple[int, int, int, int]:
+    """Pixels that a file's open container crops at the left, top, right and bottom."""
+    if not (file.is_mp4 or file.is_matroska):
         return (0, 0, 0, 0)
     level = av.logging.get_level()
     av.logging.set_level(av.logging.INFO)
@@ -240,7 +240,7 @@ def _container_crop(container: Any, stream_index: int) -> tuple[int, int, int, i
         # The side data follows the metadata, which may contain any text and must be skipped.
         _, _, side_data = text.rpartition("\n    Side data:\n")
         found = _CROPPING.search(side_data)
-        if int(number) == stream_index and found:
+        if int(number) == file.index and found:
             left, right, top, bottom = map(int, found.groups())
             return left, top, right, bottom
     return (0, 0, 0, 0)

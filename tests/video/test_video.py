@@ -247,7 +247,8 @@ def test_stream_facts(clip: Path) -> None:
         assert file.frame_rate == 25
         assert file.duration == pytest.approx(16 / 25)
         assert file.num_packets == file.likely_num_packets == 16
-        assert "mp4" in file.container
+        assert file.is_mp4
+        assert not file.is_matroska
         times = [p.pts for p in stream.packets()]
     assert times == pytest.approx(np.arange(16) / 25)
 

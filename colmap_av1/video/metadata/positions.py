@@ -161,7 +161,7 @@ def _first_picture(video: VideoFile) -> float:
     """
     with open_container(video.path, apply_edits=True) as edited:
         stream = edited.streams[video.index]
-        if "mov" not in video.container:
+        if not video.is_mp4:
             return _start(stream)
         with until_damage(), open_container(video.path) as unedited:
             shown = next((p for p in edited.demux(stream) if p.size and p.pts is not None), None)

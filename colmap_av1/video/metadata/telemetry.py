@@ -12,8 +12,8 @@ from colmap_av1.video.metadata.positions import Positions, read_positions
 
 # Tags of Apple and Android begin with this. FFmpeg needs an option to write them to .mp4 files.
 _KEYS = "com."
-# For each output format that holds subtitles, the codec, and the input container with that codec.
-_SUBTITLES = {"mp4": ("mov_text", "mov"), "matroska": ("srt", "matroska")}
+# The codec of subtitles in each output format that holds them.
+_SUBTITLES = {"mp4": "mov_text", "matroska": "srt"}
 # Equal times may differ by less than this many seconds because containers round them.
 _SAME_TIME = 0.01
 
@@ -40,14 +40,14 @@ def carrying(
     with open_container(video.path) as container:
         kind = container.streams[found.stream].type
     if kind == "subtitle" and output_format in _SUBTITLES:
-        codec, alike = _SUBTITLES[output_format]
-        how = ["-c:s", "copy" if alike in video.container else codec]
+        is_alike = video.is_mp4 if output_format == "mp4" else video.is_matroska
+        how = ["-c:s", "copy" if is_alike else _SUBTITLES[output_format]]
     elif kind == "data" and output_format == "mp4":
         how = ["-c:d", "copy", "-copy_unknown"]
     else:
         return [], words
     again = ["-i", f"file:{video}"]
-    if ignores_edits or "mov" not in video.container:
+    if ignores_edits or not video.is_mp4:
         # The stream begins with the first coded frame, whenever it is shown.
         again = ["-itsoffset", f"{-found.first_picture:.6f}", *again]
     return again, [*words, "-map", f"1:{found.stream}", *how]
