@@ -241,7 +241,7 @@ def test_options_are_derived_from_fields() -> None:
     command = Parser(prog="test")
     add_options(command, _Everything)
     text = command.format_help()
-    assert "how strongly; none: never said [2.0]" in text
+    assert "how strongly; none: never said [2]" in text
     assert "what to 100% [a,b]" in text
     assert [field.name for field in dataclasses.fields(_Everything)] == ["first", "names"]
 
