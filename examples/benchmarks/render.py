@@ -438,7 +438,7 @@ def jerks(rows: list[Row]) -> str:
         error("largest", 1.0),
     ]
     firsts = [own[0] for own in groups.values()]
-    return f"{markdown(columns, firsts)}\n{measured_at(rows, 'sequence')}"
+    return f"{markdown(columns, firsts)}\n{measured_at(rows, 'way')}"
 
 
 def read_motion(rows: list[Row], threads: str) -> str:
