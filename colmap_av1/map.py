@@ -26,8 +26,8 @@ from colmap_av1.options import MapOptions, PlaceOptions
 from colmap_av1.options.place import parse_distance
 from colmap_av1.poses.long_range import LongRangeErrors
 from colmap_av1.poses.mapper import map_poses
-from colmap_av1.poses.placing.placement import Place, Surroundings, find_placement, write_place
-from colmap_av1.poses.placing.up import some_spread, vertical_lines
+from colmap_av1.poses.placing.placement import Place, PlacementData, find_placement, write_place
+from colmap_av1.poses.placing.up import pictures_for_lines, vertical_lines
 from colmap_av1.util.arrays import Floats
 from colmap_av1.util.files import check_new_folder, whole_folder
 from colmap_av1.util.progress import Clock, Progress, no_progress
@@ -291,10 +291,10 @@ def _place(
                 image.cam_from_world,
                 up,
             )
-            for image in some_spread(images)
+            for image in pictures_for_lines(images)
         ]
 
-    known = Surroundings(read_pose_priors(database), lines=lines)
+    known = PlacementData(read_pose_priors(database), lines=lines)
     found, place_warnings = find_placement(images, dict(model.cameras), known, options, seed)
     if found.is_moved:
         model.transform(found.similarity)

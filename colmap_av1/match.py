@@ -515,7 +515,9 @@ def _match_images(
         # What to do is for `reconstruct`, whose log is kept.
         reason = str(error).rpartition(": ")[0] or str(error)
         if options.verify.verify == "joint":
-            raise type(error)(f"{reason}: leave out --verify joint") from error
+            if isinstance(error, VideoError):  # Nothing can be matched pair by pair, either.
+                raise
+            raise ModelError(f"{reason}: leave out --verify joint") from error
     videos = [_with_selected_tracks(own, options, context) for own in images.videos]
     found = _match_pairs(replace(images, videos=videos), cameras, options, context)
     if not found.depth.is_observable:

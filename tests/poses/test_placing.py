@@ -17,7 +17,7 @@ from colmap_av1.geometry.alignment import PathFit, Up, east_north_up, fit_path, 
 from colmap_av1.geometry.colmap_model import ModelImage, camera_centres
 from colmap_av1.options.place import PlaceOptions, parse_distance
 from colmap_av1.poses.placing.distance import model_distance
-from colmap_av1.poses.placing.placement import Surroundings, find_placement
+from colmap_av1.poses.placing.placement import PlacementData, find_placement
 from colmap_av1.poses.placing.up import (
     rotation_to_up,
     up_of_cameras,
@@ -225,7 +225,7 @@ def test_known_distance_between_cameras_or_marks_gives_the_scale() -> None:
     a, b = [4.0, 9.0, 1.0], [4.9, 9.0, 2.2]
     text = f"1.5={mark(a, 0)}+{mark(a, 10)},{mark(b, 3)}+{mark(b, 8)}+{mark(b, 12)}"
     assert distance(text) == pytest.approx(1.5 * world.scale, rel=1e-3)
-    known = Surroundings({})
+    known = PlacementData({})
     options = PlaceOptions(scale=text)
     found, _ = find_placement([*images.values()], {1: CAMERA}, known, options, 0)
     assert found.units == "metres"
@@ -255,7 +255,7 @@ def test_known_distance_overrides_the_scale_of_positions() -> None:
     apart = float(np.linalg.norm(centres[0] - centres[30]))
     for scale, expected in ((None, 1.1), (f"{apart}=0.png,30.png", 1.0)):
         options = PlaceOptions(scale=scale)
-        found, _ = find_placement(images, {1: CAMERA}, Surroundings(priors), options, 0)
+        found, _ = find_placement(images, {1: CAMERA}, PlacementData(priors), options, 0)
         assert found.similarity.scale * world.scale == pytest.approx(expected, rel=1e-6)
         moved = camera_centres(
             transform_poses(found.similarity, np.array([i.cam_from_world for i in images]))
@@ -279,7 +279,7 @@ def test_positions_on_both_sides_of_the_date_line_place_a_model(longitude: float
         for image, (x, y, z) in zip(images, centres, strict=True)
     }
     found, place_warnings = find_placement(
-        images, {1: CAMERA}, Surroundings(priors), PlaceOptions(), 0
+        images, {1: CAMERA}, PlacementData(priors), PlaceOptions(), 0
     )
     assert not place_warnings
     assert found.units == "metres"
@@ -291,7 +291,7 @@ def test_positions_on_both_sides_of_the_date_line_place_a_model(longitude: float
 def test_rejected_positions_name_only_the_options_that_would_help() -> None:
     images = images_of(transform_poses(elsewhere(), walk()))
     here = PosePrior(np.array([1.0, 2.0, 3.0]), is_cartesian=True)
-    known = Surroundings({image.name: here for image in images})
+    known = PlacementData({image.name: here for image in images})
     ends = f"2.5={images[0].name},{images[30].name}"
     for scale, upright in ((None, False), (None, True), (ends, False), (ends, True)):
         options = PlaceOptions(upright=upright, scale=scale)
@@ -303,7 +303,7 @@ def test_rejected_positions_name_only_the_options_that_would_help() -> None:
 
 def test_a_single_position_is_kept_when_a_model_is_turned_upright() -> None:
     images = images_of(transform_poses(elsewhere(), walk()))
-    known = Surroundings({}, place=(1.0, 2.0, 3.0))
+    known = PlacementData({}, position=(1.0, 2.0, 3.0))
     found, _ = find_placement(images, {1: CAMERA}, known, PlaceOptions(upright=True), 0)
     assert found.axes == "z up"
     assert any("single position" in how for how in found.how)

@@ -83,7 +83,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class PlacementData:
     """Data that can place a model.
 
     Attributes:
@@ -91,20 +91,20 @@ class Surroundings:
         gravity: float64 [n, 3] direction of gravity for each image, see `up_of_gravity`; None
             if unknown.
         lines: finds lines in the pictures; None without pictures.
-        place: latitude, longitude and altitude of a single position for all images; None if
+        position: latitude, longitude and altitude of a single position for all images; None if
             there is none.
     """
 
     priors: Mapping[str, PosePrior]
     gravity: Floats | None = None
     lines: Lines | None = None
-    place: tuple[float, float, float] | None = None
+    position: tuple[float, float, float] | None = None
 
 
 def find_placement(
     images: Sequence[ModelImage],
     cameras: Mapping[int, pycolmap.Camera],
-    known: Surroundings,
+    known: PlacementData,
     options: PlaceOptions,
     seed: int,
 ) -> tuple[Place, tuple[str, ...]]:
@@ -146,23 +146,22 @@ def find_placement(
 
 
 def _by_positions(
-    images: Sequence[ModelImage], poses: Floats, known: Surroundings, seed: int
+    images: Sequence[ModelImage], poses: Floats, known: PlacementData, seed: int
 ) -> Place | str:
     """The placement by the positions of images, or the reason why they do not place the model."""
     at = [i for i, image in enumerate(images) if image.name in known.priors]
     priors = [known.priors[images[i].name] for i in at]
     if not priors:
-        if known.place is None:
+        if known.position is None:
             return Place()
-        latitude, longitude, altitude = known.place
+        latitude, longitude, altitude = known.position
         where = f"{latitude:.5f}, {longitude:.5f}, {altitude:.1f} m"
         return Place(how=(f"a single position, {where}, which gives no scale or direction",))
-    cartesian = sum(prior.is_cartesian for prior in priors)
-    kind = cartesian * 2 > len(priors)
-    at = [i for i, prior in zip(at, priors, strict=True) if prior.is_cartesian == kind]
-    positions = np.array([prior.position for prior in priors if prior.is_cartesian == kind])
+    is_cartesian = 2 * sum(prior.is_cartesian for prior in priors) > len(priors)
+    at = [i for i, prior in zip(at, priors, strict=True) if prior.is_cartesian == is_cartesian]
+    positions = np.array([prior.position for prior in priors if prior.is_cartesian == is_cartesian])
     origin: Origin | None = None
-    if not kind:
+    if not is_cartesian:
         positions[:, 1] = np.unwrap(positions[:, 1], period=360.0)
         latitude, longitude, altitude = np.median(positions, axis=0).tolist()
         origin = Origin(latitude, (longitude + 180.0) % 360.0 - 180.0, altitude)
@@ -191,7 +190,7 @@ def _rough_ups(poses: Floats, gravity: Floats | None) -> list[Up]:
     return [Up(up_of_cameras(poses), _CAMERA_ERROR), Up(back, _CAMERA_ERROR)]
 
 
-def _up(poses: Floats, known: Surroundings) -> tuple[Floats, str]:
+def _up(poses: Floats, known: PlacementData) -> tuple[Floats, str]:
     """The up direction, and a description of the data that determined it."""
     measured = up_of_gravity(poses, known.gravity) if known.gravity is not None else None
     if measured is not None:

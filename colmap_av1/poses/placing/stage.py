@@ -16,11 +16,11 @@ from colmap_av1.images.positions import ImagePositions
 from colmap_av1.poses.placing.placement import (
     PLACE_FILE,
     Place,
-    Surroundings,
+    PlacementData,
     find_placement,
     write_place,
 )
-from colmap_av1.poses.placing.up import some_spread, vertical_lines
+from colmap_av1.poses.placing.up import pictures_for_lines, vertical_lines
 from colmap_av1.poses.posed_images import PosedImages, PosesResult, read_posed_images
 from colmap_av1.poses.run import Run
 from colmap_av1.util.arrays import Floats
@@ -60,7 +60,7 @@ def place_stage(
         with run.clock.measure("place"):
             # Points are marked in the written pictures.
             cameras = output_cameras(registered.cameras, undistort=undistort)
-            known = _surroundings(run, image_set, registered, positions)
+            known = _placement_data(run, image_set, registered, positions)
             found, place_warnings = find_placement(registered.images, cameras, known, options, seed)
         write_place(partial, found)
         images = registered.images
@@ -91,9 +91,9 @@ def place_stage(
     )
 
 
-def _surroundings(
+def _placement_data(
     run: Run, image_set: ImageSet, registered: PosedImages, positions: ImagePositions
-) -> Surroundings:
+) -> PlacementData:
     index = {name: i for i, name in enumerate(image_set.images.names)}
     indices = [index[image.name] for image in registered.images]
     places = positions.places
@@ -104,7 +104,7 @@ def _surroundings(
     }
 
     def lines(up: Floats) -> list[Floats]:
-        images = dict(some_spread([*zip(indices, registered.images, strict=True)]))
+        images = dict(pictures_for_lines([*zip(indices, registered.images, strict=True)]))
         return [
             vertical_lines(
                 picture,
@@ -117,4 +117,4 @@ def _surroundings(
 
     gravity = positions.gravity[indices]
     has_gravity = bool(np.isfinite(gravity).any())
-    return Surroundings(priors, gravity if has_gravity else None, lines, positions.place)
+    return PlacementData(priors, gravity if has_gravity else None, lines, positions.place)

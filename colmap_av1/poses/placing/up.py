@@ -139,7 +139,7 @@ def vertical_lines(
     return np.asarray(normals[np.abs(normals @ up) < _LARGEST_LEAN])
 
 
-def some_spread(items: Sequence[_Item]) -> list[_Item]:
+def pictures_for_lines(items: Sequence[_Item]) -> list[_Item]:
     """Choose the evenly spread items in whose pictures lines are detected."""
     return [items[i] for i in evenly_spread(len(items), _NUM_PICTURES, rounded=True)]
 
