@@ -260,7 +260,7 @@ def _pictures(
 ) -> Pictures:
     """A source of pictures in the size of the images; those of videos are kept in a folder."""
     shown = [
-        ShownVideo(**vars(own.shown), video=own.video, kept=KeptPictures(scratch / f"{number}.raw"))
+        ShownVideo.in_images(own.shown, own.video, KeptPictures(scratch / f"{number}.raw"))
         for number, own in enumerate(of_videos)
     ]
     return pictures_of(image_set, shown, [photo.path for photo in photos], options.match.reading)

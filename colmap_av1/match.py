@@ -409,7 +409,7 @@ class _Images:
     def shown(self) -> tuple[ShownVideo, ...]:
         """The videos, whose pictures are shown in the size of the images."""
         return tuple(
-            ShownVideo(**vars(own.shown), video=own.source.pictures, kept=own.source.kept)
+            ShownVideo.in_images(own.shown, own.source.pictures, own.source.kept)
             for own in self.videos
         )
 

@@ -142,7 +142,13 @@ class ShownVideo(ShownImages):
     @staticmethod
     def as_played(video: Video, kept: KeptPictures | None = None) -> ShownVideo:
         """The video with its pictures as players show them."""
-        return ShownVideo(video.display, video.picture_size, video.picture_size, video, kept)
+        size = video.picture_size
+        return ShownVideo.in_images(ShownImages(video.display, size, size), video, kept)
+
+    @staticmethod
+    def in_images(shown: ShownImages, video: Video, kept: KeptPictures | None = None) -> ShownVideo:
+        """The video with its pictures as images show them."""
+        return ShownVideo(shown.display, shown.video_size, shown.size, video, kept)
 
     def pictures(
         self, num_frames: int, options: ReadOptions, *, wanted: Collection[int], use: str
