@@ -492,7 +492,8 @@ def test_warning_names_images_that_are_not_registered(
     copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Images with fewer than 95 % of the median number of points are removed from the model.
-    monkeypatch.setattr("colmap_av1.poses.adjusting._FEW_SEEN", (10_000, 0.95))
+    monkeypatch.setattr("colmap_av1.poses.adjusting._LEAST_OBSERVED", 10_000)
+    monkeypatch.setattr("colmap_av1.poses.adjusting._LEAST_OBSERVED_SHARE", 0.95)
     (copy / ".stages" / "adjustment.json").unlink()
     found = reconstruct(SCENE, copy, options=OPTIONS)
     written = {path.name for path in (copy / "images").iterdir()}
