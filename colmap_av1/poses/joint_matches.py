@@ -28,7 +28,7 @@ from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.estimate import estimate_poses
 from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.further_models import further_poses
-from colmap_av1.poses.initial_pair import InitialPair, initial_pair
+from colmap_av1.poses.initial_pair import initial_pair
 from colmap_av1.poses.joint_cameras import joint_cameras
 from colmap_av1.poses.long_range_stage import LongRangeResult
 from colmap_av1.poses.matched_observations import (
@@ -44,7 +44,7 @@ from colmap_av1.poses.track_stage import VideoTracks, pose_tracks
 from colmap_av1.poses.unregistered import models_of_images, tracks_of_unregistered, within_models
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.arrays import Bools, Floats
+from colmap_av1.util.arrays import Bools, Floats, Ints
 from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.texts import some_names
 from colmap_av1.video.coded_size import smaller_grey
@@ -239,15 +239,17 @@ class _Agreeing:
 
     Attributes:
         registered: the registered images.
-        tracks: the tracks, without outliers: first the corners, then motion tracks.
-        num_corners: number of corners.
-        start: the initial pair for a mapper, and the tracks to match it by; None if there is none.
+        tracks: the tracks, without outliers.
+        is_corner: bool [num_tracks] corners; the others are motion tracks.
+        pair: frames of the initial pair for a mapper; None if there is none.
+        is_of_pair: bool [num_tracks] the tracks to match this pair by.
     """
 
     registered: PosedImages
     tracks: Tracks
-    num_corners: int
-    start: InitialPair | None
+    is_corner: Bools
+    pair: tuple[int, int] | None
+    is_of_pair: Bools
 
 
 def _agreeing_tracks(
@@ -271,20 +273,24 @@ def _agreeing_tracks(
     some = select_tracks(every, replace(density, max_tracks_per_image=0))
     some = some.keep_tracks(~at_same_place(some, corners, _SAME_POINT))
     motion, motion_points = _agreeing_motion(run, some, registered)
-    both = Tracks.concatenate(corners, motion)
-    start = _start(both, np.concatenate([corner_points, motion_points]), registered)
-    if start is None:
+    tracks = Tracks.concatenate(corners, motion)
+    pair, of_pair = _start(tracks, np.concatenate([corner_points, motion_points]), registered)
+    if pair is None:
         wide, points = _agreeing_motion(run, every, registered)
-        start = _start(wide, points, registered)
-        if start is not None:
-            of_pair = np.zeros(wide.num_tracks, np.bool_)
-            of_pair[start.points] = True
-            first = wide.keep_tracks(of_pair)
-            corners = corners.keep_tracks(~at_same_place(corners, first, _SAME_POINT))
-            motion = motion.keep_tracks(~at_same_place(motion, first, _SAME_TRACK))
-            both = Tracks.concatenate(corners, motion, first)
-            start = replace(start, points=np.arange(both.num_tracks)[-first.num_tracks :])
-    return _Agreeing(registered, both, corners.num_tracks, start)
+        pair, of_pair = _start(wide, points, registered)
+        further = wide.keep_tracks(np.isin(np.arange(wide.num_tracks), of_pair))
+        corners = corners.keep_tracks(~at_same_place(corners, further, _SAME_POINT))
+        motion = motion.keep_tracks(~at_same_place(motion, further, _SAME_TRACK))
+        tracks = Tracks.concatenate(corners, motion, further)
+        of_pair = np.arange(tracks.num_tracks - further.num_tracks, tracks.num_tracks)
+    number = np.arange(tracks.num_tracks)
+    return _Agreeing(
+        registered,
+        tracks,
+        is_corner=number < corners.num_tracks,
+        pair=pair,
+        is_of_pair=np.isin(number, of_pair),
+    )
 
 
 def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, Floats]:
@@ -308,14 +314,20 @@ def _agreeing_motion(run: Run, tracks: Tracks, registered: PosedImages) -> tuple
     return found.tracks.take(points.observation, points.offsets), points.xyz
 
 
-def _start(tracks: Tracks, points: Floats, registered: PosedImages) -> InitialPair | None:
-    """The initial pair for a mapper, see `initial_pair`."""
+def _start(
+    tracks: Tracks, points: Floats, registered: PosedImages
+) -> tuple[tuple[int, int] | None, Ints]:
+    """The frames of the initial pair for a mapper, and the tracks to match it by.
+
+    None and no tracks if there is no such pair, see `initial_pair`.
+    """
     view = np.searchsorted(registered.frames, tracks.frame)
     start = initial_pair(tracks.track, view, points, registered.images)
     if start is None:
-        return None
+        return None, np.empty(0, np.int64)
+    first, second = registered.frames[[start.first, start.second]].tolist()
     chosen = evenly_spread(len(start.points), _MAX_INITIAL_MATCHES)
-    return replace(start, points=start.points[chosen])
+    return (first, second), start.points[chosen]
 
 
 def _num_features(run: Run, image_set: ImageSet) -> float:
@@ -324,16 +336,6 @@ def _num_features(run: Run, image_set: ImageSet) -> float:
     sift = cv2.SIFT.create(contrastThreshold=_SIFT_CONTRAST)
     pictures = run.pictures(image_set)(some)
     return float(np.mean([len(sift.detect(smaller_grey(own))) for _, own in pictures]))
-
-
-def _matched(agreeing: _Agreeing, frames: NDArray[np.int32], limits: DensityOptions) -> Bools:
-    """Which observations are matched, see `matched_observations`."""
-    num_tracks = agreeing.tracks.num_tracks
-    is_start = np.zeros(num_tracks, np.bool_)
-    if agreeing.start is not None:
-        is_start[agreeing.start.points] = True
-    is_corner = np.arange(num_tracks) < agreeing.num_corners
-    return matched_observations(agreeing.tracks, frames, is_corner, is_start, limits)
 
 
 def _paired(
@@ -346,33 +348,31 @@ def _paired(
     """Match registered images along the tracks that agree with the poses, others along all."""
     frames = image_set.images.frames
     limits = limits_of_density(density, partial(_num_features, run, image_set))
-    tracks, starts = list[Tracks](), list[InitialPair]()
+    tracks = list[Tracks]()
+    starts = list[tuple[int, int, Ints]]()  # two images and the tracks to match them by
     num_tracks = 0
     for own in agreeing:
-        kept = _matched(own, frames, limits)
+        kept = matched_observations(own.tracks, frames, own.is_corner, own.is_of_pair, limits)
         tracks.append(own.tracks.keep_observations(kept))
-        if own.start is not None:
+        if own.pair is not None:
+            first, second = np.searchsorted(frames, own.pair).tolist()
             # Tracks without a kept observation are gone, which changes the numbers of the others.
-            is_kept = own.tracks.having(kept)
-            views = own.registered.frames[[own.start.first, own.start.second]]
-            first, second = np.searchsorted(frames, views).tolist()
-            points = np.cumsum(is_kept)[own.start.points] - 1 + num_tracks
-            starts.append(InitialPair(first, second, points))
+            of_pair = np.flatnonzero(own.is_of_pair[own.tracks.having(kept)])
+            starts.append((first, second, of_pair + num_tracks))
         num_tracks += tracks[-1].num_tracks
 
     def choose(keypoints: list[ImageKeypoints]) -> NDArray[np.int32]:
         min_matches = run.options.match.pairs.min_matches
         pairs = covisible_pairs(keypoints, min_matches, near=_NEAR, most_pairs=_MAX_PAIRS)
-        initial = [[start.first, start.second] for start in starts]
-        return np.unique(np.vstack([pairs, np.array(initial, np.int32).reshape(-1, 2)]), axis=0)
+        initial = np.array([start[:2] for start in starts], np.int32).reshape(-1, 2)
+        return np.unique(np.vstack([pairs, initial]), axis=0)
 
     paired = pair_by_tracks(Tracks.concatenate(*tracks, others), frames, choose)
     matches = list(paired.matches)
-    for start in starts:
-        is_pair = (paired.pairs == [start.first, start.second]).all(axis=1)
-        number = int(np.flatnonzero(is_pair)[0])
-        track = paired.keypoints[start.first].track[matches[number][:, 0]]
-        matches[number] = matches[number][np.isin(track, start.points)]
+    for first, second, of_pair in starts:
+        number = int(np.flatnonzero((paired.pairs == [first, second]).all(axis=1))[0])
+        track = paired.keypoints[first].track[matches[number][:, 0]]
+        matches[number] = matches[number][np.isin(track, of_pair)]
     return replace(paired, matches=matches)
 
 
