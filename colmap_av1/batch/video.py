@@ -145,7 +145,7 @@ def _attempt(work: Work, video: Video, threads: int, processes: Processes) -> Ou
         _write_thumbnail(path, folder)
         # Only another run of the same command would use intermediate results.
         for stages in [*folder.rglob(STAGES)]:
-            shutil.rmtree(stages)
+            shutil.rmtree(stages, ignore_errors=True)
         report = facts["report"]
         figures = {column: report.get(field) for column, field in _FIGURES.items()}
         if work.task == "info":

@@ -110,8 +110,8 @@ class Inputs:
         return [*of_videos, [self.masks.of_photo(photo.name, photo.size) for photo in photos]]
 
     def with_names(self, of_videos: Sequence[Sequence[str]]) -> list[str]:
-        """Notes about each video, prefixed with its name if there are several videos."""
-        return _with_names(self.videos, of_videos)
+        """See `notes_of_videos`."""
+        return notes_of_videos(self.videos, of_videos)
 
     def conversion(self, of_videos: Sequence[str | None]) -> str | None:
         """Description of how videos were converted; None if none was."""
@@ -124,7 +124,8 @@ class Inputs:
         return ", ".join(str(video) for video in self.videos)
 
 
-def _with_names(videos: Sequence[Video], of_videos: Sequence[Sequence[str]]) -> list[str]:
+def notes_of_videos(videos: Sequence[Video], of_videos: Sequence[Sequence[str]]) -> list[str]:
+    """Notes about each video, prefixed with its name if there are several videos."""
     several = len(videos) > 1
     return [
         f"{video}: {note}" if several else note
@@ -191,7 +192,9 @@ def read_inputs(
         (v.doubtful_times, implausible_position(v.tags), implausible_focal_length(v.tags))
         for v in videos
     ]
-    doubts = _with_names(videos, [[note for note in own if note is not None] for own in doubtful])
+    doubts = notes_of_videos(
+        videos, [[note for note in own if note is not None] for own in doubtful]
+    )
     notes = (*spherical, *doubts, *((warning,) if warning is not None else ()))
     inputs = Inputs(videos, of_videos, tuple(found), None, notes)
     if options.masks.mask_path is None:

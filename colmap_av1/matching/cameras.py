@@ -18,6 +18,7 @@ from colmap_av1.geometry.cameras import (
     off_centre_warning,
 )
 from colmap_av1.images.image_set import ImageSet, ShownVideo
+from colmap_av1.images.inputs import notes_of_videos
 from colmap_av1.images.photos import Photo
 from colmap_av1.matching.focal import estimate_focal_length
 from colmap_av1.matching.matched_images import PairedImages
@@ -73,12 +74,11 @@ def new_cameras(
     """
     of_images: dict[int, pycolmap.Camera] = {}
     estimated: list[float | None] = []
-    notes: list[str] = []
+    notes: list[list[str]] = [[] for _ in shown]
     for shared in _sequences_by_camera(len(shown), photos, options):
-        given, aspect, name = options, 1.0, ""
+        given, aspect = options, 1.0
         if shared[0] < len(shown):
             first = shown[shared[0]]
-            name = f"{first.video}: " if len(shown) > 1 else ""
             size, aspect = first.size, first.pixel_aspect
             of_videos = [i for t in shared if t < len(shown) for i in image_set.images_of(t)]
             own = _some_images(paired, of_videos)
@@ -89,20 +89,24 @@ def new_cameras(
                 focal_length, words = _initial_focal_length(
                     focal_length, stated, given.camera_model
                 )
-                notes += [f"{name}{note}" for note in words]
+                notes[shared[0]] += words
         else:
             photo = photos[shared[0] - len(shown)]
             size, focal_length = photo.size, photo.focal_length
             given = replace(given, camera_params=None)
         camera = make_camera(given, *size, aspect, focal_length)
-        words = check_pixel_aspect(camera, aspect, "leave out --camera_model or give one")
-        off_centre = off_centre_warning(camera) if given.camera_params is not None else None
-        words += [off_centre] if off_centre is not None else []
-        notes += [f"{name}{note}" for note in words]
+        if shared[0] < len(shown):
+            notes[shared[0]] += check_pixel_aspect(
+                camera, aspect, "leave out --camera_model or give one"
+            )
+            off_centre = off_centre_warning(camera) if given.camera_params is not None else None
+            if off_centre is not None:
+                notes[shared[0]].append(off_centre)
         for image in (image for sequence in shared for image in image_set.images_of(sequence)):
             of_images[image] = copy.copy(camera) if given.single_camera is False else camera
     in_order = [of_images[image] for image in range(len(image_set.sequence))]
-    return ImageCameras(in_order, estimated[0], tuple(notes))
+    warnings = notes_of_videos([own.video for own in shown], notes)
+    return ImageCameras(in_order, estimated[0], tuple(warnings))
 
 
 def shared_focal_length(

@@ -115,10 +115,10 @@ def few_matches_warning(gaps: Sequence[Gap]) -> str | None:
 
 def matching_warning(matched: MatchedImages, image_set: ImageSet) -> str | None:
     """Warn of gaps with few matches between images of a video."""
-    names = image_set.images.names
+    names, used = image_set.images.names, matched.is_used
     gaps = few_match_gaps(
-        matched.pairs[matched.is_used],
-        matched.num_inliers[matched.is_used],
+        matched.pairs[used],
+        matched.num_inliers[used],
         names,
         image_set.sequence.tolist(),
         order=range(len(names)),
