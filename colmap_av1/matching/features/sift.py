@@ -98,8 +98,8 @@ def match_features(a: Features, b: Features) -> NDArray[np.uint32]:
     similarity = a.descriptors @ b.descriptors.T
     rows = np.arange(len(similarity))
     nearest = similarity.argmax(axis=1)
-    is_mutual = similarity.argmax(axis=0)[nearest] == rows
     best = similarity[rows, nearest]
+    is_mutual = best == similarity.max(axis=0)[nearest]  # `argmax` is slow along columns
     similarity[rows, nearest] = -1
     second = similarity.max(axis=1)
     angle, second_angle = (np.arccos(np.clip(x, -1, 1)) for x in (best, second))
