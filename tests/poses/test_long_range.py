@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -102,6 +104,23 @@ def test_images_of_another_size_are_refused(made: ReconstructReport, tmp_path: P
         cv2.imwrite(str(tmp_path / path.name), np.zeros((20, 30, 3), np.uint8))
     with pytest.raises(ImageError, match="30x20"):
         model_long_range_errors(read_model(made.output / "sparse" / "0"), tmp_path)
+
+
+def test_folder_without_any_image_of_the_model_is_refused(
+    made: ReconstructReport, tmp_path: Path
+) -> None:
+    model = read_model(made.output / "sparse" / "0")
+    for path in (made.output / "images").iterdir():
+        shutil.copyfile(path, tmp_path / f"other_{path.name}")
+    with pytest.raises(ImageError, match=f"^{re.escape(str(tmp_path))}: "):
+        model_long_range_errors(model, tmp_path)
+    # With too few images for a pair, no picture is read.
+    few = pycolmap.Reconstruction(model)
+    for image_id in sorted(few.images)[3:]:
+        few.deregister_frame(few.images[image_id].frame_id)
+    with pytest.raises(ImageError, match=f"^{re.escape(str(tmp_path))}: "):
+        model_long_range_errors(few, tmp_path)
+    assert model_long_range_errors(few, made.output / "images").median is None
 
 
 @pytest.mark.parametrize(
