@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 import pycolmap
@@ -15,18 +16,24 @@ from sequences import model_poses
 from colmap_av1.evaluate import pose_errors
 from colmap_av1.geometry.colmap_model import ModelImage, read_model
 from colmap_av1.geometry.model_points import ModelPoints
-from colmap_av1.geometry.posed_model import PosedModel
+from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_posed_model
 from colmap_av1.images.image_set import ImageSet
+from colmap_av1.options import ReconstructOptions
+from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.false_links import (
     contradicted_seams,
     jumping_seams,
     leaping_seams,
     misplaced_seams,
 )
-from colmap_av1.poses.parts import certain_parts, parts_of
+from colmap_av1.poses.mapping_stage import MappedResult
+from colmap_av1.poses.parts import certain_parts, parts_of, split_stage
+from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_matches import tracks_of_model
 from colmap_av1.reconstruct import reconstruct
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.stages import Kept
 
 
 def model(image_set: ImageSet, views: list[list[int]]) -> PosedModel:
@@ -163,6 +170,57 @@ def test_a_camera_that_is_too_fast_at_a_seam_shows_false_links(jump: int, is_fal
     seams = [(image_set.images.names[9], image_set.images.names[10])]
     nothing = Tracks.empty(24, (640, 480))
     assert jumping_seams(known, every, nothing, seams) == (seams if is_false else [])
+
+
+@pytest.mark.parametrize("is_true", [False, True])
+def test_speed_at_a_seam_shows_false_links_only_without_tracks(is_true: bool) -> None:
+    """A camera may truly be 2.2 times as fast: tracks then cross the seam and fit the poses."""
+    image_set, seams = images(24), [seam(images(24), 9)]
+    views = [[k, k + 1, k + 2] for k in range(22) if is_true or k not in (8, 9)]
+    known = model(image_set, [own for own in views for _ in range(40)])
+    for number, image in enumerate(known.images):
+        image.cam_from_world[0, 3] = -number - (1.2 if number >= 10 else 0.0)
+    seen = seen_at(known, [10.0] * len(known.points.xyz))
+    tracks = tracks_of_model(seen, image_set)
+    assert jumping_seams(seen, image_set, tracks, seams) == ([] if is_true else seams)
+    assert contradicted_seams(seen, image_set, tracks, seams) == []
+    assert leaping_seams(seen, image_set) == []
+
+
+@pytest.mark.parametrize("is_connected", [False, True])
+def test_a_jump_splits_a_model_only_if_nothing_else_does(
+    is_connected: bool, tmp_path: Path
+) -> None:
+    """The camera jumps between images 23 and 24. Images 11 and 12 may have no common points."""
+    image_set = images(36)
+    joined = [*stretch(12, 17, 23, 24, 35), *(stretch(0, 11, 12, 23) if is_connected else [])]
+    known = model(image_set, [*stretch(0, 11), *joined])
+    for image in known.images[24:]:
+        image.cam_from_world[0, 3] -= 30
+    write_posed_model(tmp_path / "adjusted.npz", known)
+    seams = (seam(image_set, 11), seam(image_set, 23))
+    result = AdjustedResult("adjusted.npz", 36, 0, (), seams, (), 0.0, None, False)
+    mapped = Kept(MappedResult("poses.npz", 36, "incremental", ()), "0", False)
+    nothing = Tracks.empty(36, (640, 480))
+    inputs: Any = None  # only used by earlier stages
+    run = Run(inputs, (), (), tmp_path, tmp_path, ReconstructOptions(), RunContext())
+    split = split_stage(
+        run,
+        image_set,
+        mapped,
+        Kept(result, "1", False),
+        seams,
+        leaps=[],
+        tracks=nothing,
+        whole=nothing,
+        rival=None,
+        number=3,
+    )
+    files = [split.result.poses, *split.result.other_models]
+    parts = [set(read_posed_model(tmp_path / file).by_name) for file in files]
+    at_seam, at_jump = (names(image_set, *range(k)) for k in (12, 24))
+    every = names(image_set, *range(36))
+    assert parts == ([at_jump, every - at_jump] if is_connected else [every - at_seam, at_seam])
 
 
 @pytest.mark.parametrize("is_true", [True, False])
