@@ -34,13 +34,14 @@ from colmap_av1.options import (
     ImageOptions,
     MatchOptions,
     ReconstructOptions,
+    TrackOptions,
     TriangulateOptions,
 )
 from colmap_av1.poses.dynamic.contradictions import Contradictions, TracksInCells, tracks_in_cells
 from colmap_av1.poses.dynamic.following import expect_in_views, follow_occluded
 from colmap_av1.poses.dynamic.regions import dynamic_cells, shares_above_usual, strong_patches
 from colmap_av1.poses.dynamic.short_tracks import static_points
-from colmap_av1.poses.dynamic.stage import without_dynamic_links
+from colmap_av1.poses.dynamic.stage import without_dynamic_links, without_dynamic_tracks
 from colmap_av1.poses.posed_images import PosedImages
 from colmap_av1.poses.run import Run
 from colmap_av1.reconstruct import reconstruct
@@ -242,6 +243,39 @@ def test_objects_that_move_between_two_images_do_not_separate_their_links() -> N
     left = without_dynamic_links(links, image_set, masks)
     assert left.frame.tolist() == [0, 9, 0, 9]
     assert left.offsets.tolist() == [0, 2, 4]
+
+
+@pytest.mark.parametrize("observed", [1, 3])
+def test_shortest_length_of_tracks_counts_frames_and_not_images(
+    tmp_path: Path, observed: int
+) -> None:
+    """Every third frame is an image, and tracks may have observations in the images only."""
+    kept = np.ones((HEIGHT, WIDTH), np.bool_)
+    kept[:, 100:200] = False
+    frames = np.arange(0, 30, 3, dtype=np.int32)
+    images = ChosenImages([str(frame) for frame in frames], frames)
+    image_set = number_images([""], [images], [30])
+    # The first two are next to a moving object, the others go behind it in frame 15.
+    spans = [(0, 9), (0, 6), (3, 27), (9, 21)]
+    seen = [np.arange(first, last + 1, observed) for first, last in spans]
+    x = np.repeat([50, 50, 150, 150], [len(own) for own in seen])
+    tracks = Tracks(
+        num_frames=30,
+        width=WIDTH,
+        height=HEIGHT,
+        offsets=np.cumsum([0, *map(len, seen)]),
+        frame=np.concatenate(seen).astype(np.int32),
+        xy=np.column_stack([x, np.full(len(x), 50)]).astype(np.float32),
+        sigma=np.zeros(len(x), np.float32),
+        confirmed=np.ones(len(x), np.bool_),
+    )
+    inputs: Any = None  # only used by earlier stages
+    options = ReconstructOptions(match=MatchOptions(tracks=TrackOptions(min_length=10)))
+    run = Run(inputs, (), (), tmp_path, tmp_path, options, RunContext())
+    left = without_dynamic_tracks(tracks, image_set, {"15": make_mask(kept)}, run)
+    first, last = left.frame[left.offsets[:-1]], left.frame[left.offsets[1:] - 1]
+    before, after = (12, 18) if observed == 3 else (14, 16)
+    assert list(zip(first, last, strict=True)) == [(0, 9), (3, before), (after, 27)]
 
 
 def test_points_of_few_images_are_static_if_one_image_shows_no_motion() -> None:
