@@ -5,6 +5,9 @@ from __future__ import annotations
 import functools
 import http.server
 import os
+import shutil
+import signal
+import subprocess
 import sys
 import tempfile
 import threading
@@ -12,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from dense_scene import SCENE
 
 from colmap_av1.cli import main
 from colmap_av1.database.reading import read_images
@@ -126,3 +130,33 @@ def test_python_functions_refuse_urls() -> None:
             open_container(Path(address)),
         ):
             pass
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals end processes differently there")
+def test_terminated_estimate_of_the_read_out_time_leaves_no_copy(
+    server: str, tmp_path: Path, scratch: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra remote")
+    monkeypatch.setenv("TMPDIR", str(scratch))
+    shutil.copyfile(SCENE, tmp_path / "served" / "scene.mp4")
+    before = sorted(tmp_path.rglob("*"))
+    program = [sys.executable, "-X", "importtime", "-m", "colmap_av1"]
+    words = ["info", "--video", f"{server}/scene.mp4", "--rolling_shutter", "estimate"]
+    with subprocess.Popen(
+        [*program, *words],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stderr is not None
+        for line in process.stderr:  # the module of the estimate is imported last
+            if line.endswith(" colmap_av1.matching.shutter.of_video\n"):
+                break
+        assert [path.name for path in scratch.rglob("*.mp4")] == ["scene.mp4"]
+        process.terminate()
+        printed, rest = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert printed == ""
+    assert [line for line in rest.splitlines() if not line.startswith("import time:")] == []
+    assert sorted(tmp_path.rglob("*")) == before
