@@ -505,23 +505,49 @@ def test_warning_names_images_that_are_not_registered(
     assert not_registered[0] in warning
 
 
-@pytest.mark.parametrize("num_certain", [14, 0])
-def test_uncertain_images_of_a_model_that_may_bend_are_removed(
-    copy: Path, monkeypatch: pytest.MonkeyPatch, num_certain: int
-) -> None:
-    """If no image is certain, all are kept, with a warning."""
-    # Every seam may bend, but none splits the model.
+@pytest.fixture
+def may_bend(copy: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The copy, whose model may bend at every seam, although none splits it, for the next run."""
     monkeypatch.setattr("colmap_av1.poses.seams._LOST", 2.0)
     monkeypatch.setattr("colmap_av1.poses.seams._SCALED", 1_000_000)
     monkeypatch.setattr("colmap_av1.poses.seams._DEEP", -1)
     monkeypatch.setattr("colmap_av1.poses.parts._WITHIN_VIDEO", 0)
     monkeypatch.setattr("colmap_av1.geometry.uncertainty.MAX_CERTAIN_ERROR", 0.0)
+    (copy / ".stages" / "adjustment.json").unlink()
+    return copy
+
+
+@pytest.mark.parametrize("num_certain", [14, 0])
+def test_uncertain_images_of_a_model_that_may_bend_are_removed(
+    may_bend: Path, monkeypatch: pytest.MonkeyPatch, num_certain: int
+) -> None:
+    """If no image is certain, all are kept, with a warning."""
     certain = {f"frame_{EVERY * i:06d}.jpg" for i in range(num_certain)}
     monkeypatch.setattr("colmap_av1.poses.parts.certain_parts", lambda *_: [certain])
-    (copy / ".stages" / "adjustment.json").unlink()
-    found = reconstruct(SCENE, copy, options=OPTIONS)
+    found = reconstruct(SCENE, may_bend, options=OPTIONS)
     assert found.num_registered == (num_certain or NUM_IMAGES)
     assert any("positions" in warning for warning in found.warnings)
+
+
+def test_long_range_checks_of_a_split_model_are_resumed(
+    may_bend: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both the check of the whole model and that of the part that is left."""
+    certain = {f"frame_{EVERY * i:06d}.jpg" for i in range(14)}
+    monkeypatch.setattr("colmap_av1.poses.parts.certain_parts", lambda *_: [certain])
+    checks = []
+
+    def watch(stage: str, done: int, total: int | None) -> None:
+        if stage == "long range" and done == total:
+            checks.append(total)
+
+    first = reconstruct(SCENE, may_bend, options=OPTIONS, progress=watch)
+    assert len(checks) == 2
+    again = reconstruct(SCENE, may_bend, options=OPTIONS, progress=watch)
+    assert len(checks) == 2
+    assert "long_range" in again.resumed
+    assert first.long_range is not None
+    assert (again.long_range, again.num_registered) == (first.long_range, 14)
 
 
 def test_adjustment_makes_the_mapped_poses_more_accurate(
