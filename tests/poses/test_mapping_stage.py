@@ -113,6 +113,7 @@ def map_scene(scene: Scene, params: str, folder: Path, *, is_assumed: bool = Fal
     [
         ("rotates", {"turning": True, "num_points": 400}, CAMERA_PARAMS, False),
         ("few tracks", {"num_points": 30}, CAMERA_PARAMS, False),
+        ("few tracks", {"num_points": 650, "noise": 300.0}, CAMERA_PARAMS, False),  # all are wrong
         ("focal length", {"num_points": 400}, FAR_OFF, True),
         ("intrinsics", {"num_points": 400}, FAR_OFF, False),
     ],
