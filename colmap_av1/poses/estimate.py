@@ -146,7 +146,7 @@ class _Estimates:
         run = self._run(links)
 
         def make() -> Estimate:
-            return split_at_seams(run, self.whole(links, first), self.image_set)
+            return split_at_seams(run, self.whole(links, first), self.image_set).estimate
 
         return self._split.get((links, first), make)
 

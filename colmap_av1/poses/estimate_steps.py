@@ -8,7 +8,7 @@ adjusted observations, and split at seams that hardly any points connect.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import count
 
 from colmap_av1.errors import ModelError
@@ -45,19 +45,21 @@ _LEAST_KEPT = 0.9
 class Estimate:
     """The finished stages of the joint estimate, and the tracks that agree with its poses.
 
+    Each step takes an estimate and returns one with further stages.
+
     Attributes:
         matches: the database of the key images, see `match_stage`; that of the first model.
         mapped: the poses of the key images, see `mapping_stage`; after a second mapping or a split,
             those of all its images.
-        resection: the poses of the images in between; None if all images are key images.
-        dynamic: the dynamic objects; None if they were not looked for.
-        adjustment: the adjusted poses; None if they are not adjusted.
         tracks: the tracks of all videos, cut at gaps that links replace and at seams of splits,
             without dynamic pixels.
         link_tracks: links as tracks, without dynamic pixels.
-        dynamic_masks: masks that exclude dynamic objects, by image name.
         has_picture_positions: whether tracks have positions in the pictures; false if they were
             corrected for a rolling shutter.
+        resection: the poses of the images in between; None if all images are key images.
+        dynamic: the dynamic objects; None if they were not looked for.
+        dynamic_masks: masks that exclude dynamic objects, by image name.
+        adjustment: the adjusted poses; None if they are not adjusted.
         long_range: the long-range check; None if it was not made.
         rival: the adjustment of the first mapping if a second one replaced it, but fits the
             observations hardly better; else None.
@@ -65,13 +67,13 @@ class Estimate:
 
     matches: Kept[MatchesResult]
     mapped: Kept[MappedResult]
-    resection: Kept[PosesResult] | None
-    dynamic: Kept[DynamicResult] | None
-    adjustment: Kept[AdjustedResult] | None
     tracks: Tracks
     link_tracks: Tracks
-    dynamic_masks: dict[str, Mask]
     has_picture_positions: bool
+    resection: Kept[PosesResult] | None = None
+    dynamic: Kept[DynamicResult] | None = None
+    dynamic_masks: dict[str, Mask] = field(default_factory=dict)
+    adjustment: Kept[AdjustedResult] | None = None
     long_range: Kept[LongRangeResult] | None = None
     rival: Kept[AdjustedResult] | None = None
 
@@ -165,46 +167,91 @@ def pose_images(
     mapped = found.models
     if first is not None:
         mapped = with_model_first(run, mapped, first)
-    # Without a read-out time the tracks were not corrected.
-    has_picture_positions = not any(own.read_out for own in videos)
-    trusted = trusted_tracks(run, [own.tracks for own in videos], image_set)
-    estimate = refined_poses(
+    estimate = mapped_poses(
         run,
         found.matched,
         mapped,
-        trusted=trusted,
-        image_set=image_set,
-        keyed=found.keyed,
-        has_picture_positions=has_picture_positions,
+        [own.tracks for own in videos],
+        image_set,
+        # Without a read-out time the tracks were not corrected.
+        has_picture_positions=not any(own.read_out for own in videos),
     )
+    estimate = refined_poses(run, estimate, image_set, found.keyed)
     if _is_doubtful(estimate):
         estimate = remapped_poses(run, estimate, image_set, least_kept=_LEAST_KEPT)
-    return replace(estimate, long_range=_long_range_check(run, estimate, image_set))
+    return _long_range_check(run, estimate, image_set)
 
 
-def _long_range_check(
-    run: Run, estimate: Estimate, image_set: ImageSet, *, number: int = 1
-) -> Kept[LongRangeResult]:
-    """The long-range check of the poses; `number` as in `long_range_stage`."""
-    return long_range_stage(
-        run,
-        estimate.tracks,
-        image_set,
-        estimate.dynamic_masks,
-        estimate.last,
-        masks_digest=estimate.masks_digest,
-        searched_loops=estimate.matches.result.links.searched_loops,
-        number=number,
-    )
+def mapped_poses(
+    run: Run,
+    matched: Kept[MatchesResult],
+    mapped: Kept[MappedResult],
+    tracks: Sequence[Tracks],
+    image_set: ImageSet,
+    *,
+    has_picture_positions: bool,
+) -> Estimate:
+    """The poses of a mapper, and the links and the tracks cut at gaps that links replace.
 
-
-def trusted_tracks(
-    run: Run, tracks: Sequence[Tracks], image_set: ImageSet
-) -> tuple[Tracks, Tracks]:
-    """The tracks of all videos, cut at gaps that links replace, and the links."""
+    Args:
+        run: the run that was matched.
+        matched: the database that was mapped.
+        mapped: the poses of the mapper.
+        tracks: the tracks of each video.
+        image_set: all images.
+        has_picture_positions: see `Estimate`.
+    """
     links, contradicted = read_links(run.stages)
     every = Tracks.in_sequence(tracks, image_set.num_frames)
-    return every.split_after_frames(contradicted.tolist()), links
+    cut = every.split_after_frames(contradicted.tolist())
+    return Estimate(matched, mapped, cut, links, has_picture_positions)
+
+
+def refined_poses(run: Run, estimate: Estimate, image_set: ImageSet, keyed: ImageSet) -> Estimate:
+    """Estimate the poses of the images between the key images, and adjust all poses.
+
+    Args:
+        run: the run.
+        estimate: the poses of the mapper, see `mapped_poses`.
+        image_set: the images.
+        keyed: the key images.
+    """
+    if len(keyed.sequence) < len(image_set.sequence):
+        resection = resection_stage(run, estimate.tracks, image_set, keyed, estimate.mapped)
+        estimate = replace(estimate, resection=resection)
+    if run.options.moving != "keep":
+        dynamic = dynamic_stage(run, estimate.tracks, image_set, estimate.last)
+        masks = read_dynamic_masks(run.stages)
+        estimate = replace(estimate, dynamic=dynamic, dynamic_masks=masks)
+    masks = estimate.dynamic_masks
+    estimate = replace(
+        estimate,
+        tracks=without_dynamic_tracks(estimate.tracks, image_set, masks, run),
+        link_tracks=without_dynamic_links(estimate.link_tracks, image_set, masks),
+    )
+    if not run.options.poses.adjust:
+        return estimate
+    return _adjusted(run, estimate, image_set, estimate.last)
+
+
+def _adjusted(
+    run: Run, estimate: Estimate, image_set: ImageSet, poses: Kept[PosesResult], *, number: int = 1
+) -> Estimate:
+    """The estimate with adjusted poses, see `adjustment_stage`."""
+    adjustment = adjustment_stage(
+        run,
+        estimate.tracks,
+        estimate.link_tracks,
+        image_set,
+        poses,
+        dynamic_masks=estimate.dynamic_masks,
+        masks_digest=estimate.masks_digest,
+        has_picture_positions=estimate.has_picture_positions,
+        is_fast=bool(estimate.matches.result.links.fast),
+        is_assumed=estimate.matches.result.assumes_focal_length and number == 1,
+        number=number,
+    )
+    return replace(estimate, adjustment=adjustment)
 
 
 def _is_doubtful(estimate: Estimate) -> bool:
@@ -242,85 +289,47 @@ def remapped_poses(
         return estimate
     rival = None if again.result.is_clearly_better else estimate.adjustment
     estimate = replace(estimate, mapped=again, rival=rival)
-    return replace(estimate, adjustment=_adjusted(run, estimate, image_set, again, number=2))
+    return _adjusted(run, estimate, image_set, again, number=2)
 
 
-def _adjusted(
-    run: Run, estimate: Estimate, image_set: ImageSet, poses: Kept[PosesResult], *, number: int = 1
-) -> Kept[AdjustedResult]:
-    """Adjust poses, see `adjustment_stage`."""
-    return adjustment_stage(
+def _long_range_check(
+    run: Run, estimate: Estimate, image_set: ImageSet, *, number: int = 1
+) -> Estimate:
+    """The estimate with a long-range check of its poses; `number` as in `long_range_stage`."""
+    check = long_range_stage(
         run,
         estimate.tracks,
-        estimate.link_tracks,
         image_set,
-        poses,
-        dynamic_masks=estimate.dynamic_masks,
+        estimate.dynamic_masks,
+        estimate.last,
         masks_digest=estimate.masks_digest,
-        has_picture_positions=estimate.has_picture_positions,
-        is_fast=bool(estimate.matches.result.links.fast),
-        is_assumed=estimate.matches.result.assumes_focal_length and number == 1,
+        searched_loops=estimate.matches.result.links.searched_loops,
         number=number,
     )
+    return replace(estimate, long_range=check)
 
 
-def refined_poses(
-    run: Run,
-    matched: Kept[MatchesResult],
-    mapped: Kept[MappedResult],
-    *,
-    trusted: tuple[Tracks, Tracks],
-    image_set: ImageSet,
-    keyed: ImageSet,
-    has_picture_positions: bool,
-) -> Estimate:
-    """Estimate the poses of the images between the key images, and adjust all poses.
+@dataclass(frozen=True)
+class SplitModel:
+    """A model after it was split.
 
-    Args:
-        run: the run.
-        matched: the database that was mapped.
-        mapped: the poses of the mapper.
-        trusted: the tracks and links, see `trusted_tracks`.
-        image_set: the images.
-        keyed: the key images.
-        has_picture_positions: see `Estimate`.
+    Attributes:
+        estimate: the poses of its largest part.
+        uncertain: result of `certain_stage` if too few images of this part are certain; else None.
     """
-    tracks, links = trusted
-    resection = dynamic = None
-    poses: Kept[PosesResult] = mapped
-    if len(keyed.sequence) < len(image_set.sequence):
-        poses = resection = resection_stage(run, tracks, image_set, keyed, mapped)
-    dynamic_masks: dict[str, Mask] = {}
-    if run.options.moving != "keep":
-        dynamic = dynamic_stage(run, tracks, image_set, poses)
-        dynamic_masks = read_dynamic_masks(run.stages)
-    tracks = without_dynamic_tracks(tracks, image_set, dynamic_masks, run)
-    links = without_dynamic_links(links, image_set, dynamic_masks)
-    estimate = Estimate(
-        matches=matched,
-        mapped=mapped,
-        resection=resection,
-        dynamic=dynamic,
-        adjustment=None,
-        tracks=tracks,
-        link_tracks=links,
-        dynamic_masks=dynamic_masks,
-        has_picture_positions=has_picture_positions,
-    )
-    if not run.options.poses.adjust:
-        return estimate
-    return replace(estimate, adjustment=_adjusted(run, estimate, image_set, poses))
+
+    estimate: Estimate
+    uncertain: Kept[MappedResult] | None = None
 
 
 def split_at_seams(
     run: Run, estimate: Estimate, image_set: ImageSet, *, is_further: bool = False
-) -> Estimate:
+) -> SplitModel:
     """Split the model at seams with few points, and adjust the largest part separately.
 
     If pictures far apart in time contradict the poses, it is split at doubtful seams, too. The
     separate adjustment may change the number of points at a seam, so the seams of the largest part
-    are checked again until no split is left. Motion across a seam is not used any more, because it
-    may be wrong there. Links are: without them, a part that returns to a place would fall apart.
+    are checked again until no split is left.
 
     Images of a model with such seams are also removed if their positions are uncertain, see
     `certain_parts`. Further models, which pictures far apart do not check, are also split where the
@@ -332,19 +341,14 @@ def split_at_seams(
         image_set: the images.
         is_further: the model is not the first: leaps are tested, and images with uncertain
             positions are removed even if there are no such seams.
-
-    Returns:
-        The poses of the largest part. If too few of its images are certain, it is returned with all
-        of them; with `is_further`, its mapped model then has no images, and the poses of the
-        other stages must not be used.
     """
     may_bend = is_further
     whole = estimate.tracks
     for number in count(_FIRST_SPLIT):
         if estimate.adjustment is None:
             break
-        adjusted = estimate.adjustment.result
-        seams, num_images = estimate.seams_to_split, adjusted.num_registered
+        num_images = estimate.adjustment.result.num_registered
+        seams = estimate.seams_to_split
         leaps = leaping_seams(read_poses(run, estimate.adjustment), image_set) if is_further else []
         may_bend |= bool(seams)
         parts = None
@@ -370,21 +374,39 @@ def split_at_seams(
             )
             if parts.result.num_registered == num_images:
                 break
-        if parts.result.num_registered == 0:
-            return replace(estimate, mapped=parts) if is_further else estimate
-        frame_of = image_set.images.frame_of
+            if parts.result.num_registered == 0:
+                return SplitModel(estimate, uncertain=parts)
         kept = read_poses(run, parts).by_name.keys()
         cut = [*seams, *(leap for leap in leaps if not kept >= {*leap})]
-        frames = [frame_of[first] for first, _ in cut]
-        estimate = replace(
-            estimate,
-            mapped=parts,
-            tracks=estimate.tracks.split_after_frames(frames),
-        )
-        estimate = replace(
-            estimate, adjustment=_adjusted(run, estimate, image_set, parts, number=number)
-        )
-        if estimate.long_range is not None:
-            check = _long_range_check(run, estimate, image_set, number=number)
-            estimate = replace(estimate, long_range=check)
-    return estimate
+        estimate = _largest_part(run, estimate, image_set, parts, cut, number=number)
+    return SplitModel(estimate)
+
+
+def _largest_part(
+    run: Run,
+    estimate: Estimate,
+    image_set: ImageSet,
+    parts: Kept[MappedResult],
+    cut: Sequence[tuple[str, str]],
+    *,
+    number: int,
+) -> Estimate:
+    """Adjust and check the largest part of a model separately.
+
+    Motion across a seam is not used any more, because it may be wrong there. Links are: without
+    them, a part that returns to a place would fall apart.
+
+    Args:
+        run: the run.
+        estimate: the poses of the model.
+        image_set: the images.
+        parts: its parts.
+        cut: names of the images before and after each seam.
+        number: number of the adjustment.
+    """
+    frame_of = image_set.images.frame_of
+    tracks = estimate.tracks.split_after_frames([frame_of[first] for first, _ in cut])
+    estimate = replace(estimate, mapped=parts, tracks=tracks)
+    estimate = _adjusted(run, estimate, image_set, parts, number=number)
+    is_checked = estimate.long_range is not None
+    return _long_range_check(run, estimate, image_set, number=number) if is_checked else estimate

@@ -12,10 +12,10 @@ from colmap_av1.geometry.posed_model import PosedModel, read_posed_model, write_
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.estimate_steps import (
     Estimate,
+    mapped_poses,
     refined_poses,
     remapped_poses,
     split_at_seams,
-    trusted_tracks,
 )
 from colmap_av1.poses.mapping_stage import MappedResult
 from colmap_av1.poses.parts import MIN_MODEL_SIZE
@@ -91,7 +91,8 @@ def further_poses(
     """
     first_model = read_poses(run, first.last)
     free = set(image_set.images.names) - first_model.by_name.keys()
-    waiting = [_with_cameras_of(first_model, other) for other in _other_models(run, first)]
+    others = _other_models(run, first.mapped)
+    waiting = [_with_cameras_of(first_model, other) for other in others]
     number = 1
     while waiting:
         mapped = waiting.pop(0)
@@ -105,35 +106,34 @@ def further_poses(
         candidates = free.difference(mapped.excluded, *(other.model.by_name for other in waiting))
         some = _named(image_set, known | candidates)
         try:
-            estimate = refined_poses(
-                own,
+            estimate = mapped_poses(
+                run,
                 first.matches,
                 own_poses,
-                trusted=trusted_tracks(run, read_tracks(), image_set),
-                image_set=some,
-                keyed=_named(image_set, known),
+                read_tracks(),
+                image_set,
                 has_picture_positions=first.has_picture_positions,
             )
+            estimate = refined_poses(own, estimate, some, _named(image_set, known))
             if map_again:
                 estimate = remapped_poses(own, estimate, some, least_kept=_LEAST_KEPT)
-            estimate = split_at_seams(own, estimate, some, is_further=True)
+            split = split_at_seams(own, estimate, some, is_further=True)
         except ModelError:  # too few tracks agree with these poses
-            estimate = None
+            split = None
         used = set[str]()
-        if estimate is not None:
-            registered = _registered(own, estimate)
-            is_certain = estimate.mapped.result.num_registered > 0
-            if is_certain and len(registered & free) >= MIN_MODEL_SIZE:
+        if split is not None:
+            registered = set(read_poses(own, split.estimate.last).by_name)
+            if split.uncertain is None and len(registered & free) >= MIN_MODEL_SIZE:
                 used = registered & free
             # If a model is not used, its parts must not grow into it again.
             excluded = frozenset() if used else mapped.excluded | registered | known
-            waiting += _other_models(own, estimate, excluded)
+            waiting += _other_models(own, split.uncertain or split.estimate.mapped, excluded)
         lost = frozenset((known & free) - used)
-        if estimate is None or not used:
+        if split is None or not used:
             yield TriedModel(None, lost)
             continue
         number += 1
-        yield TriedModel(FurtherPoses(own, estimate, _named(image_set, free)), lost)
+        yield TriedModel(FurtherPoses(own, split.estimate, _named(image_set, free)), lost)
         free -= used
     _remove_further_models(run, number)
 
@@ -156,18 +156,14 @@ class _MappedModel:
 
 
 def _other_models(
-    run: Run, estimate: Estimate, excluded: frozenset[str] = frozenset()
+    run: Run, mapped: Kept[MappedResult], excluded: frozenset[str] = frozenset()
 ) -> list[_MappedModel]:
-    models = {f: read_posed_model(run.stages / f) for f in estimate.mapped.result.other_models}
+    """The models of a stage except the first, without some images that they do not have."""
+    models = {file: read_posed_model(run.stages / file) for file in mapped.result.other_models}
     return [
-        _MappedModel(estimate.mapped.digest, file, model, excluded.difference(model.by_name))
+        _MappedModel(mapped.digest, file, model, excluded.difference(model.by_name))
         for file, model in models.items()
     ]
-
-
-def _registered(run: Run, estimate: Estimate) -> set[str]:
-    """The names of the registered images."""
-    return set(read_poses(run, estimate.last).by_name)
 
 
 def _named(image_set: ImageSet, names: AbstractSet[str]) -> ImageSet:

@@ -120,7 +120,7 @@ def certain_stage(
 ) -> Kept[MappedResult]:
     """Keep the images of an adjusted model whose positions are certain, see `certain_parts`.
 
-    Arguments and result are as for `split_stage`. No image is registered if too few are certain.
+    Arguments and result are as for `split_stage`. The first part is empty if too few are certain.
     """
 
     def parts(known: PosedModel) -> list[AbstractSet[str]]:
