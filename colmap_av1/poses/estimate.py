@@ -35,59 +35,48 @@ _LEAST_SHARE = 0.5
 
 
 @dataclass(frozen=True)
-class _FirstModel:
-    """Which of the mapper's models becomes the first.
+class _Plan:
+    """What an estimate is made from.
 
     Attributes:
-        file: the file of the model; None for the largest before models are split.
-    """
-
-    file: str | None
-
-
-@dataclass(frozen=True)
-class _FurtherLinks:
-    """Where links are looked for after the first estimate.
-
-    Attributes:
-        doubted: frames after doubtful seams where no links were looked for.
-        loops: whether to look for loop closures, because pictures far apart in time contradict the
-            poses, and none were looked for.
-        none: whether no links are used at all, because only poses with links are contradicted.
+        doubted: frames after doubtful seams, where links replace motion.
+        links: sift: look for loop closures in all videos; none: use no links; None: as in the
+            options of the run.
+        first: file of the mapper's model to continue with; None for the largest.
     """
 
     doubted: tuple[int, ...] = ()
-    loops: bool = False
-    none: bool = False
+    links: Literal["sift", "none"] | None = None
+    first: str | None = None
 
 
 @dataclass(frozen=True)
 class _FirstEstimate:
-    """What the estimate without further links shows.
+    """What the first estimate shows, which has no further links.
 
     Attributes:
-        links: where links are looked for.
+        further: the plan with further links where they are needed.
         can_be_kept: whether no pictures contradict the poses, or a split may correct them.
     """
 
-    links: _FurtherLinks
+    further: _Plan
     can_be_kept: bool
 
 
-_NOTHING_FURTHER = _FurtherLinks()
+_FIRST_PLAN = _Plan()
 
 
 class _Last(Generic[_Value]):
     """The last result of a kind; freed before the next is made, because estimates are large."""
 
     def __init__(self) -> None:
-        self._made: tuple[tuple[Any, ...], _Value] | None = None
+        self._made: tuple[_Plan, _Value] | None = None
 
-    def get(self, key: tuple[Any, ...], make: Callable[[], _Value]) -> _Value:
-        """The last result if it has the same key, else a new one."""
-        if self._made is None or self._made[0] != key:
+    def get(self, plan: _Plan, make: Callable[[], _Value]) -> _Value:
+        """The last result if it has the same plan, else a new one."""
+        if self._made is None or self._made[0] != plan:
             self._made = None
-            self._made = key, make()
+            self._made = plan, make()
         return self._made[1]
 
 
@@ -107,7 +96,7 @@ class _Outcome:
 
 
 class _Estimates:
-    """Estimates with different links.
+    """Estimates by different plans.
 
     Attributes:
         run: the run.
@@ -117,53 +106,43 @@ class _Estimates:
     def __init__(self, run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> None:
         self.run, self.image_set = run, image_set
         self._videos = videos
-        self._mapped, self._whole, self._split = (
-            _Last[KeyImageModels](),
-            _Last[Estimate](),
-            _Last[Estimate](),
+        self._mapped = _Last[KeyImageModels]()
+        self._whole = _Last[Estimate]()
+        self._split = _Last[Estimate]()
+
+    def mapped(self, plan: _Plan) -> KeyImageModels:
+        """The mapper's models of the key images."""
+        return self._mapped.get(
+            replace(plan, first=None),
+            lambda: map_key_images(
+                self._run(plan), self._videos, self.image_set, doubted=plan.doubted
+            ),
         )
 
-    def mapped(self, links: _FurtherLinks) -> KeyImageModels:
-        """The mapper's models of the key images."""
-        run = self._run(links)
+    def whole(self, plan: _Plan) -> Estimate:
+        """The adjusted poses of the first of these models."""
+        return self._whole.get(
+            plan,
+            lambda: pose_images(
+                self._run(plan), self._videos, self.image_set, self.mapped(plan), plan.first
+            ),
+        )
 
-        def make() -> KeyImageModels:
-            return map_key_images(run, self._videos, self.image_set, doubted=links.doubted)
-
-        return self._mapped.get((links,), make)
-
-    def whole(self, links: _FurtherLinks, first: str | None) -> Estimate:
-        """The adjusted poses of one of these models, given by its file; None: the largest."""
-        run = self._run(links)
-
-        def make() -> Estimate:
-            return pose_images(run, self._videos, self.image_set, self.mapped(links), first)
-
-        return self._whole.get((links, first), make)
-
-    def split(self, links: _FurtherLinks, first: str | None) -> Estimate:
+    def split(self, plan: _Plan) -> Estimate:
         """These poses, split at doubtful seams."""
-        run = self._run(links)
+        return self._split.get(
+            plan,
+            lambda: split_at_seams(self._run(plan), self.whole(plan), self.image_set).estimate,
+        )
 
-        def make() -> Estimate:
-            return split_at_seams(run, self.whole(links, first), self.image_set).estimate
-
-        return self._split.get((links, first), make)
-
-    def outcome(self, links: _FurtherLinks, first: str | None = None) -> _Outcome:
+    def outcome(self, plan: _Plan) -> _Outcome:
         """What the estimate shows after it is split."""
-        estimate = self.split(links, first)
+        estimate = self.split(plan)
         size = estimate.last.result.num_registered
         return _Outcome(size, estimate.is_contradicted, estimate.is_confirmed)
 
-    def is_split(self, links: _FurtherLinks) -> bool:
-        """Whether the largest model is split."""
-        return self.split(links, None) is not self.whole(links, None)
-
-    def _run(self, links: _FurtherLinks) -> Run:
-        if links.none:
-            return _with_links(self.run, "none")
-        return _with_links(self.run, "sift") if links.loops else self.run
+    def _run(self, plan: _Plan) -> Run:
+        return _with_links(self.run, plan.links) if plan.links is not None else self.run
 
 
 def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> Estimate:
@@ -188,83 +167,82 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
         return stage.result
 
     first = decided("first_estimate", [], _FirstEstimate, lambda: _first_estimate(estimates))
-    further = decided(
-        "further_links", [first], _FurtherLinks, lambda: _further_links(estimates, first)
-    )
-    links = decided("links", [further], _FurtherLinks, lambda: _used_links(estimates, further))
-    model = decided("first_model", [links], _FirstModel, lambda: _first_model(estimates, links))
-    return estimates.split(links, model.file)
+    further = decided("further_links", [first], _Plan, lambda: _further_links(estimates, first))
+    links = decided("links", [further], _Plan, lambda: _used_links(estimates, further))
+    model = decided("first_model", [links], _Plan, lambda: _first_model(estimates, links))
+    return estimates.split(model)
 
 
 def _first_estimate(estimates: _Estimates) -> _FirstEstimate:
     """Make the first estimate, and see where further links are needed."""
-    run, estimate = estimates.run, estimates.whole(_NOTHING_FURTHER, None)
-    links = _FurtherLinks(
+    run, estimate = estimates.run, estimates.whole(_FIRST_PLAN)
+    further = _Plan(
         doubted=tuple(_unlinked_seams(run, estimates.image_set, estimate)),
-        loops=_needs_loops(run, estimate),
+        links="sift" if _needs_loops(run, estimate) else None,
     )
-    return _FirstEstimate(links, not estimate.is_contradicted or bool(estimate.seams_to_split))
+    return _FirstEstimate(further, not estimate.is_contradicted or bool(estimate.seams_to_split))
 
 
-def _further_links(estimates: _Estimates, first: _FirstEstimate) -> _FurtherLinks:
+def _further_links(estimates: _Estimates, first: _FirstEstimate) -> _Plan:
     """Whether to use further links: not if pictures contradict only the poses with them.
 
     Links may follow an object that moves.
     """
-    if first.links == _NOTHING_FURTHER:
-        return _NOTHING_FURTHER
+    if first.further == _FIRST_PLAN:
+        return _FIRST_PLAN
     try:
-        linked = estimates.outcome(first.links)
+        linked = estimates.outcome(first.further)
     except ModelError:  # the poses without them can be used
-        return _NOTHING_FURTHER
+        return _FIRST_PLAN
     if not first.can_be_kept or not linked.is_contradicted:
-        return first.links
-    plain = estimates.outcome(_NOTHING_FURTHER)
+        return first.further
+    plain = estimates.outcome(_FIRST_PLAN)
     is_large = plain.num_registered >= _LEAST_SHARE * linked.num_registered
-    return _NOTHING_FURTHER if is_large and not plain.is_contradicted else first.links
+    return _FIRST_PLAN if is_large and not plain.is_contradicted else first.further
 
 
-def _used_links(estimates: _Estimates, further: _FurtherLinks) -> _FurtherLinks:
+def _used_links(estimates: _Estimates, plan: _Plan) -> _Plan:
     """Whether to use links at all: not if pictures contradict only the poses with links.
 
     Several videos, and photos, are connected by links only.
     """
-    linked = estimates.outcome(further)
+    linked = estimates.outcome(plan)
     may_mislead = (
         estimates.run.options.match.links.links == "auto"
         and estimates.image_set.num_sequences == 1
-        and estimates.split(further, None).link_tracks.num_tracks > 0
+        and estimates.split(plan).link_tracks.num_tracks > 0
     )
     if not (may_mislead and linked.is_contradicted):
-        return further
-    none = _FurtherLinks(none=True)
+        return plan
+    without_links = _Plan(links="none")
     try:
-        plain = estimates.outcome(none)
+        plain = estimates.outcome(without_links)
     except (ModelError, VideoError):  # without links, there may be nothing to match
-        return further
+        return plan
     is_large = plain.num_registered >= _LEAST_SHARE * linked.num_registered
-    return none if is_large and plain.is_confirmed else further
+    return without_links if is_large and plain.is_confirmed else plan
 
 
-def _first_model(estimates: _Estimates, links: _FurtherLinks) -> _FirstModel:
+def _first_model(estimates: _Estimates, plan: _Plan) -> _Plan:
     """Which of the mapper's models becomes the first: the second, if the first is split smaller."""
-    if not estimates.is_split(links):
-        return _FirstModel(None)
-    size = estimates.outcome(links).num_registered
-    other = _larger_model(estimates, links, size)
+    if estimates.split(plan) is estimates.whole(plan):
+        return plan
+    size = estimates.outcome(plan).num_registered
+    other = _larger_model(estimates, plan, size)
     if other is None:
-        return _FirstModel(None)
+        return plan
+    with_other = replace(plan, first=other)
     try:
-        second = estimates.outcome(links, other)
+        second = estimates.outcome(with_other)
     except ModelError:  # too few tracks agree with its poses
-        return _FirstModel(None)
+        return plan
     is_better = second.num_registered > size and not second.is_contradicted
-    return _FirstModel(other if is_better else None)
+    return with_other if is_better else plan
 
 
-def _larger_model(estimates: _Estimates, links: _FurtherLinks, size: int) -> str | None:
+def _larger_model(estimates: _Estimates, plan: _Plan, size: int) -> str | None:
     """The file of the mapper's second model; None if it has no more than `size` images."""
-    mapped = estimates.mapped(links)
+    mapped = estimates.mapped(plan)
     others = mapped.models.result.other_models  # sorted by size
     if not others:
         return None
