@@ -313,8 +313,8 @@ def _run_stages(run: Run) -> ReconstructReport:
     run = replace(run, positions=positions)
     estimate = estimate_poses(run, videos, image_set)
     del videos  # These tracks are as large as those in `estimate`.
-    placed, written = written_model(run, estimate, image_set)
-    further, not_registered = further_models(run, estimate, image_set)
+    placed, written = written_model(run, estimate, image_set, positions)
+    further, not_registered = further_models(run, estimate, image_set, positions)
     assert estimate.long_range is not None
     matches, poses, model = estimate.matches.result, estimate.last.result, written.result
     registered = read_poses(run, estimate.last)

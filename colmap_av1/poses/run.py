@@ -29,7 +29,7 @@ class Run:
         stages: its subfolder with the results that later runs resume from.
         options: options of all stages.
         context: clock, progress, threads and seed of the run.
-        positions: positions of the images; None if they are not known, or have no use.
+        positions: positions of the images, for the database; None leaves them out.
         cameras: cameras of all images in an existing database; None creates them.
     """
 

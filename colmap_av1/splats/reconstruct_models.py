@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_av1.images.image_set import ImageSet
+from colmap_av1.images.positions import ImagePositions
 from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.further_models import further_poses
 from colmap_av1.poses.placing.stage import PlaceResult, place_stage
@@ -54,17 +55,16 @@ class FurtherModel:
 
 
 def written_model(
-    run: Run, estimate: Estimate, image_set: ImageSet
+    run: Run, estimate: Estimate, image_set: ImageSet, positions: ImagePositions
 ) -> tuple[Kept[PlaceResult], Kept[ModelResult]]:
     """Place the model in the world, and write it with the points of all tracks."""
-    assert run.positions is not None
-    placed = place_stage(run, image_set, estimate.last, run.positions)
+    placed = place_stage(run, image_set, estimate.last, positions)
     tracks = Tracks.concatenate(estimate.tracks, estimate.link_tracks)
     return placed, model_stage(run, tracks, image_set, estimate.dynamic_masks, placed)
 
 
 def further_models(
-    run: Run, first: Estimate, image_set: ImageSet
+    run: Run, first: Estimate, image_set: ImageSet, positions: ImagePositions
 ) -> tuple[tuple[FurtherModel, ...], list[str]]:
     """Write the models that are not connected with the first, each in a separate folder.
 
@@ -83,15 +83,11 @@ def further_models(
         if own is None:
             continue
         index = np.searchsorted(image_set.images.frames, own.image_set.images.frames)
-        assert run.positions is not None
         # The known distance is between points of the first model.
         place = replace(own.run.options.place, scale=None)
-        placing = replace(
-            own.run,
-            options=replace(own.run.options, place=place),
-            positions=run.positions.some(index),
-        )
-        model = written_model(placing, own.estimate, own.image_set)[1].result
+        placing = replace(own.run, options=replace(own.run.options, place=place))
+        _, written = written_model(placing, own.estimate, own.image_set, positions.some(index))
+        model = written.result
         images = read_posed_images(own.run, own.estimate.last, own.image_set).images
         names = [image.name for image in images]
         registered.update(names)
