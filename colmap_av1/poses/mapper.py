@@ -8,14 +8,21 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from colmap_av1.errors import ModelError, WriteError
 from colmap_av1.geometry.colmap_model import read_model
 from colmap_av1.matching.mapper_limits import FORWARD_MOTION
 from colmap_av1.options import MapOptions
 from colmap_av1.poses import mapper_process as child
-from colmap_av1.poses.mapper_process import run_mapping
+from colmap_av1.poses.mapper_process import (
+    AdjustmentSettings,
+    MapperSettings,
+    MappingSettings,
+    Settings,
+    StartSettings,
+    run_mapping,
+)
 from colmap_av1.util.cpus import BLAS_THREADS, threads_or_cpus
 from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.util.processes import bound
@@ -82,7 +89,7 @@ def map_poses(
     output.mkdir(parents=True, exist_ok=True)
     settings = _mapping_settings(database, output, options, image_path)
     if effort == "video" and options.mapper == "incremental":
-        settings |= {"growth": _VIDEO_GROWTH, "tolerance": _VIDEO_TOLERANCE}
+        settings["growth"], settings["tolerance"] = _VIDEO_GROWTH, _VIDEO_TOLERANCE
     elif effort == "early":
         settings["tolerance"] = _EARLY_TOLERANCE
     progress("poses", 0, num_images)
@@ -132,22 +139,30 @@ def _mapping_settings(
     output: Path,
     options: MapOptions,
     image_path: Path | None,
-) -> dict[str, Any]:
+) -> MappingSettings:
     initial_pair = FORWARD_MOTION.options if options.forward_motion else {}
     if options.init_min_tri_angle is not None:
         initial_pair = {**initial_pair, "init_min_tri_angle": options.init_min_tri_angle}
     return {
+        **_mapper_settings(database, output, options, initial_pair),
         "task": "mapping",
-        "database": str(database),
-        "model": str(output),
         "image_path": str(image_path) if image_path is not None else None,
+        "growth": None,
+        "tolerance": None,
+    }
+
+
+def _mapper_settings(
+    database: Path, output: Path, options: MapOptions, initial_pair: dict[str, float]
+) -> MapperSettings:
+    return {
+        "database": str(database),
+        "output": str(output),
         "mapper": options.mapper,
         "refine_intrinsics": options.refine_intrinsics,
         "initial_pair": initial_pair,
         "seed": options.seed,
         "num_threads": threads_or_cpus(options.num_threads),
-        "growth": None,
-        "tolerance": None,
     }
 
 
@@ -175,8 +190,11 @@ def start_mapper(
     Raises:
         ModelError: the mapper failed; the log holds the details.
     """
-    settings = _mapping_settings(database, database.parent, options, None)
-    settings |= {"task": "start", "num_images": num_images, "initial_pair": initial_pair}
+    settings: StartSettings = {
+        **_mapper_settings(database, database.parent, options, initial_pair),
+        "task": "start",
+        "num_images": num_images,
+    }
     names: list[str] | None = None
 
     def hear(word: str, value: str) -> None:
@@ -221,14 +239,14 @@ def adjust_model(
         ModelError: the adjustment failed; the log holds the details.
         WriteError: the model is incomplete.
     """
-    settings = {
+    settings: AdjustmentSettings = {
         "task": "adjustment",
         "model": str(model),
         "refine_intrinsics": refine_intrinsics,
         "loss_scales": list(loss_scales),
         "seed": seed,
         "num_threads": num_threads,
-        "max_num_iterations": max_steps,
+        "max_steps": max_steps,
         "tolerance": tolerance,
         "iterative": iterative,
     }
@@ -248,7 +266,7 @@ def _check_whole(model: Path) -> None:
 
 
 def _run_in_process(
-    settings: dict[str, Any],
+    settings: Settings,
     hear: Callable[[str, str], None] | None,
     log: Path,
     *,

@@ -12,7 +12,7 @@ import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 # Initial radius of Ceres' trust region in adjustments after the first, a hundred times its default.
 # Near the minimum, the default slows down changes that are poorly determined, as that of the scale
@@ -25,7 +25,73 @@ _FIRST_TOLERANCE = 1e-3
 _MAX_DENSE_IMAGES = 400
 
 
-def run_child(settings: dict[str, Any]) -> None:
+class MapperSettings(TypedDict):
+    """Settings of a mapper.
+
+    Attributes:
+        database: the database.
+        output: an existing folder for the models.
+        mapper: the mapper.
+        refine_intrinsics: refine focal length and distortion.
+        initial_pair: limits for the initial pair, by the names of the mapper's options.
+        seed: the random seed.
+        num_threads: number of threads.
+    """
+
+    database: str
+    output: str
+    mapper: Literal["incremental", "global"]
+    refine_intrinsics: bool
+    initial_pair: dict[str, float]
+    seed: int
+    num_threads: int
+
+
+class MappingSettings(MapperSettings):
+    """Settings of `run_mapping`.
+
+    Attributes:
+        image_path: folder of the images, for the colours of points; None leaves them black.
+        growth: all images are adjusted whenever their number or that of points has grown by this
+            factor; None: COLMAP's default.
+        tolerance: function tolerance of the global bundle adjustment; None: COLMAP's default.
+    """
+
+    task: Literal["mapping"]
+    image_path: str | None
+    growth: float | None
+    tolerance: float | None
+
+
+class StartSettings(MapperSettings):
+    """Settings of a start of the incremental mapper, see `start_mapper`.
+
+    Attributes:
+        num_images: number of images at which the mapper is stopped.
+    """
+
+    task: Literal["start"]
+    num_images: int
+
+
+class AdjustmentSettings(TypedDict):
+    """Settings of a bundle adjustment, see `adjust_model`."""
+
+    task: Literal["adjustment"]
+    model: str
+    refine_intrinsics: bool
+    loss_scales: list[float]
+    seed: int
+    num_threads: int
+    max_steps: int
+    tolerance: float
+    iterative: bool
+
+
+Settings = MappingSettings | StartSettings | AdjustmentSettings
+
+
+def run_child(settings: Settings) -> None:
     """Map or adjust in this process, and print progress to standard output."""
     # Ctrl-C also reaches the parent, which ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -56,11 +122,11 @@ def run_child(settings: dict[str, Any]) -> None:
     channel.close()
 
 
-def run_mapping(settings: dict[str, Any], on_image: Callable[[], None] | None = None) -> list[int]:
+def run_mapping(settings: MappingSettings, on_image: Callable[[], None] | None = None) -> list[int]:
     """Map a database, see `run_mapper`.
 
     Args:
-        settings: see `_mapping_settings`.
+        settings: the settings.
         on_image: called whenever the incremental mapper registers an image.
 
     Returns:
@@ -69,7 +135,7 @@ def run_mapping(settings: dict[str, Any], on_image: Callable[[], None] | None = 
     import numpy as np  # noqa: F401, PLC0415 - before pycolmap
     import pycolmap  # noqa: PLC0415 - after the redirection in run_child
 
-    database, output = Path(settings["database"]), Path(settings["model"])
+    database, output = Path(settings["database"]), Path(settings["output"])
     refine = settings["refine_intrinsics"]
     pycolmap.set_random_seed(settings["seed"])
     # pycolmap writes each model as soon as it is finished, but the largest is to come first.
@@ -110,7 +176,7 @@ def run_mapping(settings: dict[str, Any], on_image: Callable[[], None] | None = 
     return [model.num_reg_images() for model in found]
 
 
-def _incremental_options(settings: dict[str, Any]) -> Any:
+def _incremental_options(settings: MapperSettings) -> Any:
     """Options of the incremental mapper."""
     import pycolmap  # noqa: PLC0415 - after the redirection in run_child
 
@@ -129,7 +195,7 @@ class _EnoughImagesError(Exception):
     """The first model has enough images."""
 
 
-def _start(settings: dict[str, Any]) -> list[str] | None:
+def _start(settings: StartSettings) -> list[str] | None:
     """Begin to map, see `start_mapper`."""
     import pycolmap  # noqa: PLC0415 - after the redirection in run_child
 
@@ -147,7 +213,7 @@ def _start(settings: dict[str, Any]) -> list[str] | None:
 
     how = _incremental_options(settings)
     how.multiple_models = False
-    output = Path(settings["model"]) / "start"
+    output = Path(settings["output"]) / "start"
     output.mkdir(exist_ok=True)
     callbacks: Any = {"initial_image_pair_callback": start, "next_image_callback": go_on}
     try:
@@ -161,7 +227,7 @@ def _start(settings: dict[str, Any]) -> list[str] | None:
     return [image.name for image in models[0].images.values() if image.has_pose]
 
 
-def _adjust(settings: dict[str, Any]) -> None:
+def _adjust(settings: AdjustmentSettings) -> None:
     import pycolmap  # noqa: PLC0415 - after the redirection in run_child
 
     model = pycolmap.Reconstruction(settings["model"])
@@ -175,7 +241,7 @@ def _adjust(settings: dict[str, Any]) -> None:
         options.ceres.max_num_images_direct_sparse_cpu_solver = 2
     solver = options.ceres.solver_options
     solver.num_threads = settings["num_threads"]
-    solver.max_num_iterations = settings["max_num_iterations"]
+    solver.max_num_iterations = settings["max_steps"]
     scales = settings["loss_scales"]
     for number, scale in enumerate(scales, start=1):
         if number > 1:
