@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_av1.geometry.masks import Mask
+from colmap_av1.geometry.masks import Mask, joined_masks
 from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.files import read_image
 from colmap_av1.images.orientation import ShownImages
@@ -80,6 +80,13 @@ class ImageSet:
         masks = tuple(self.masks[i] for i in chosen)
         taken = self.sequence[chosen]
         return replace(self, images=self.images.some(index), sequence=taken, masks=masks)
+
+    def masked_by(self, others: Mapping[str, Mask]) -> ImageSet:
+        """The images with their masks joined with those of their names in `others`, if any."""
+        masks = zip(self.masks, self.images.names, strict=True)
+        return replace(
+            self, masks=tuple(joined_masks(mask, others.get(name)) for mask, name in masks)
+        )
 
     def of_video(self, video: int) -> ChosenImages:
         """The images of a video, with frames numbered within the video."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from colmap_av1.geometry.cameras import has_long_focal_length
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.model_points import ModelPoints
-from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
+from colmap_av1.geometry.posed_model import write_posed_model
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.adjusting import (
@@ -126,7 +126,7 @@ def adjustment_stage(
     has_gaps = bool(dynamic_masks) or has_changing_masks(image_set)
 
     def make(partial: Path) -> AdjustedResult:
-        registered = read_posed_images(run, poses, image_set).masked_by(dynamic_masks)
+        registered = read_posed_images(run, poses, image_set.masked_by(dynamic_masks))
         # Not kept in a variable: the long tracks need several times the memory of the selection.
         spread = select_tracks(pose_tracks(run, tracks).keep_frames(registered.frames), _ADJUSTED)
         if has_picture_positions and has_gaps:
@@ -144,9 +144,7 @@ def adjustment_stage(
             points = [_triangulated_points(run, registered, *own) for own in sets]
             check_agreement(sum(len(own.xyz) for own in points), spread.num_tracks)
             run.progress("adjustment", 0, 1)
-            model = PosedModel(
-                registered.cameras, registered.images, ModelPoints.concatenate(points)
-            )
+            model = replace(registered.model, points=ModelPoints.concatenate(points))
             iterative = len(model.images) >= _ITERATIVE_IMAGES and not is_fast
             adjusted = adjust_posed(run, model, iterative=iterative)
             is_long = any(map(has_long_focal_length, adjusted.model.cameras.values()))

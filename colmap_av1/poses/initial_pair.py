@@ -8,7 +8,7 @@ pose. Points beside the road do have a large angle, so that the pair is matched 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +67,7 @@ def initial_pair(
     point: Ints,
     view: Ints,
     xyz: Floats,
-    images: list[ModelImage],
+    images: Sequence[ModelImage],
 ) -> InitialPair | None:
     """Find the pair with the most points at a large angle, with sideways motion if possible.
 
@@ -93,7 +93,7 @@ def initial_pair(
 
 
 def _candidates(
-    point: Ints, view: Ints, xyz: Floats, images: list[ModelImage]
+    point: Ints, view: Ints, xyz: Floats, images: Sequence[ModelImage]
 ) -> Iterator[_Candidate]:
     poses = np.array([image.cam_from_world for image in images])
     centres = camera_centres(poses)

@@ -72,7 +72,7 @@ def long_range_stage(
     """
 
     def make(_: Path) -> LongRangeResult:
-        registered = read_posed_images(run, poses, image_set).masked_by(dynamic_masks)
+        registered = read_posed_images(run, poses, image_set.masked_by(dynamic_masks))
         errors = _compared(run, tracks, image_set, registered)
         return LongRangeResult(
             median=errors.median,
@@ -104,7 +104,7 @@ def _compared(
         index_of = dict(zip(indices, check.wanted, strict=True))
         for done, (k, picture) in enumerate(run.pictures(image_set)(indices), start=1):
             index = index_of[k]
-            check.add(index, picture, registered.masks[index])
+            check.add(index, picture, registered.image_set.masks[index])
             run.progress("long range", done, len(indices))
         return check.result()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.colmap_model import ModelImage
-from colmap_av1.geometry.masks import Mask, joined_masks
 from colmap_av1.geometry.posed_camera import views_of
 from colmap_av1.geometry.posed_model import PosedModel, read_posed_model
 from colmap_av1.geometry.track_points import TriangulatedTracks, triangulate_tracks
@@ -19,7 +18,6 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import TriangulateOptions
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.arrays import Ints
 from colmap_av1.util.stages import Kept
 
 # For pose estimation even points of uncertain depth are useful, so their depth error is unlimited.
@@ -44,35 +42,41 @@ class PosesResult:
 
 @dataclass(frozen=True)
 class PosedImages:
-    """The registered images.
+    """The registered images of an image set.
 
     Attributes:
-        images: the images, in the order of their frames.
-        frames: int32 [n] their frames, counted through all sequences.
-        sequence: int32 [n] their sequences.
-        first_frame: first frame of each sequence, see `ImageSet`.
-        cameras: their pycolmap.Cameras, by id.
-        masks: which pixels of each image are used; None for all.
+        model: their poses and cameras, without points. The images are in the order of the set.
+        image_set: their frames, videos and masks.
     """
 
-    images: list[ModelImage]
-    frames: NDArray[np.int32]
-    sequence: NDArray[np.int32]
-    first_frame: Ints
-    cameras: dict[int, pycolmap.Camera]
-    masks: tuple[Mask | None, ...]
+    model: PosedModel
+    image_set: ImageSet
+
+    @property
+    def images(self) -> Sequence[ModelImage]:
+        """The images with their poses."""
+        return self.model.images
+
+    @property
+    def cameras(self) -> Mapping[int, pycolmap.Camera]:
+        """Their cameras, by id."""
+        return self.model.cameras
 
     @property
     def camera_of_image(self) -> list[pycolmap.Camera]:
         """The camera of each image."""
         return [self.cameras[image.camera_id] for image in self.images]
 
-    def masked_by(self, others: Mapping[str, Mask]) -> PosedImages:
-        """The images with their masks joined with those of their names in `others`, if any."""
-        masks = zip(self.masks, self.images, strict=True)
-        return replace(
-            self, masks=tuple(joined_masks(mask, others.get(own.name)) for mask, own in masks)
-        )
+    @property
+    def frames(self) -> NDArray[np.int32]:
+        """int32 [num_images] frames of the images, numbered through all sequences."""
+        return self.image_set.images.frames
+
+    def of_video(self, video: int) -> PosedImages:
+        """The images of a video."""
+        own = self.image_set.images_of(video)
+        images = self.images[own.start : own.stop]
+        return PosedImages(replace(self.model, images=images), self.image_set.some(own))
 
 
 def read_poses(run: Run, poses: Kept[PosesResult]) -> PosedModel:
@@ -93,8 +97,7 @@ def posed_images_of(poses: PosedModel, image_set: ImageSet) -> PosedImages:
     found = [posed_by_name[names[i]] for i in index]
     cameras = {camera_id: poses.cameras[camera_id] for camera_id in {i.camera_id for i in found}}
     images = [replace(image, image_id=i + 1) for i, image in enumerate(found)]
-    own = image_set.some(index)
-    return PosedImages(images, own.images.frames, own.sequence, own.first_frame, cameras, own.masks)
+    return PosedImages(PosedModel(cameras, images), image_set.some(index))
 
 
 def triangulate_in(

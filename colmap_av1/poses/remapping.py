@@ -218,7 +218,7 @@ def _costs(
     points, agreeing = triangulated.model_points(), triangulated.points.observation
     if len(points.xyz) == 0:
         return 0.0, 0.0, 0.0
-    adjusted = adjust_posed(run, PosedModel(registered.cameras, registered.images, points)).model
+    adjusted = adjust_posed(run, replace(registered.model, points=points)).model
     known_errors = reprojection_errors(known)[in_both][agreeing]
     return (
         len(agreeing) / len(triangulated.view),

@@ -66,20 +66,16 @@ def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -
         frame: (image.camera_id, image.cam_from_world)
         for frame, image in zip(known.frames.tolist(), known.images, strict=True)
     }
-    for video in sorted(
-        {int(sequence) for sequence in known.sequence if sequence < len(image_set.videos)}
-    ):
-        own = np.flatnonzero(known.sequence == video)
-        frames = known.frames[own]
-        images = image_set.images_of(video)
-        left = np.setdiff1d(image_set.images.frames[images.start : images.stop], frames)
-        if len(left) == 0:
+    for video in range(len(image_set.videos)):
+        own, images = known.of_video(video), image_set.images_of(video)
+        left = np.setdiff1d(image_set.images.frames[images.start : images.stop], own.frames)
+        if len(own.images) == 0 or len(left) == 0:
             continue
-        nearest = own[np.abs(frames[:, None] - left).argmin(axis=0)]
-        camera_ids = [known.images[i].camera_id for i in nearest]
+        nearest = np.abs(own.frames[:, None] - left).argmin(axis=0)
+        camera_ids = [own.images[i].camera_id for i in nearest]
         cameras = [known.cameras[camera_id] for camera_id in camera_ids]
         guesses = interpolate_poses(
-            np.array([known.images[i].cam_from_world for i in own]), frames, left
+            np.array([image.cam_from_world for image in own.images]), own.frames, left
         )
         found = resect(
             sightings_of(with_points, spread, left, cameras),

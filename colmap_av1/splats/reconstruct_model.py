@@ -126,15 +126,15 @@ def _write_images(
     def report(count: int) -> None:
         progress("images", done + count, len(names))
 
-    for sequence in np.unique(registered.sequence).tolist():
-        own = np.flatnonzero(registered.sequence == sequence)
-        first = int(registered.first_frame[sequence])
+    for sequence in np.unique(registered.image_set.sequence).tolist():
+        own = registered.image_set.images_of(sequence)
+        first = int(registered.image_set.first_frame[sequence])
         if sequence < len(run.sources):
             write_images(
                 run.sources[sequence].pictures,
                 folder,
-                [names[i] for i in own],
-                (registered.frames[own] - first).tolist(),
+                names[own.start : own.stop],
+                (registered.frames[own.start : own.stop] - first).tolist(),
                 num_threads=run.context.num_threads,
                 operating_point=options.match.read.operating_point,
                 change=functools.partial(change, first),
@@ -145,7 +145,7 @@ def _write_images(
         else:
             photo = run.inputs.photos[sequence - len(run.sources)]
             (folder / photo.name).parent.mkdir(parents=True, exist_ok=True)
-            shown = _undistorted(read_image(photo.path), undistort(int(own[0])))
+            shown = _undistorted(read_image(photo.path), undistort(own[0]))
             write_image(folder / photo.name, shown)
             report(1)
         done += len(own)
@@ -173,7 +173,7 @@ def _written_cloud(
     return swept_cloud(
         tracked,
         views,
-        registered.sequence,
+        registered.image_set.sequence,
         show,
         max_points=options.max_points,
         num_threads=run.context.num_threads,
@@ -271,8 +271,9 @@ def model_stage(
         registered = read_posed_images(run, poses, image_set)
         cameras = output_cameras(registered.cameras, undistort=options.undistort)
         images = registered.images
-        given = undistorted_masks(registered.masks, registered.camera_of_image, cameras)
-        joined = registered.masked_by(dynamic_masks).masks
+        masks = registered.image_set.masks
+        given = undistorted_masks(masks, registered.camera_of_image, cameras)
+        joined = registered.image_set.masked_by(dynamic_masks).masks
         valid = undistorted_masks(joined, registered.camera_of_image, cameras)
         views = views_of(images, cameras, valid)
         with clock.measure("points"):

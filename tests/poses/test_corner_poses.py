@@ -57,11 +57,14 @@ def scene() -> tuple[PosedImages, Tracks]:
         sigma=np.full(total, 0.25, np.float32),
         confirmed=np.ones(total, np.bool_),
     )
-    first = np.array([0, NUM_IMAGES])
-    registered = PosedImages(
-        images, frames, np.zeros(NUM_IMAGES, np.int32), first, {1: camera}, (None,) * NUM_IMAGES
+    image_set = ImageSet(
+        ("",),
+        ChosenImages([image.name for image in images], frames),
+        np.zeros(NUM_IMAGES, np.int32),
+        np.array([0, NUM_IMAGES]),
+        (None,) * NUM_IMAGES,
     )
-    return registered, tracks
+    return PosedImages(PosedModel({1: camera}, images), image_set), tracks
 
 
 RUN = cast(Any, SimpleNamespace(options=ReconstructOptions(), context=RunContext()))
@@ -73,7 +76,8 @@ def test_wrong_pose_is_corrected_from_corners() -> None:
     turned = Rotation.from_euler("xyz", [0.4, 0.7, 0.2], degrees=True).as_matrix() @ true
     images = list(registered.images)
     images[WRONG] = replace(images[WRONG], cam_from_world=turned)
-    found = resect_from_corners(RUN, corners, replace(registered, images=images))
+    wrong = replace(registered, model=replace(registered.model, images=images))
+    found = resect_from_corners(RUN, corners, wrong)
     for image, right in zip(found.images, registered.images, strict=True):
         # Rotation error in pixels.
         off = np.abs(image.cam_from_world[:, :3] - right.cam_from_world[:, :3]).max() * FOCAL
@@ -125,13 +129,6 @@ def test_links_join_images_across_a_gap_in_the_tracks(
         progress=no_progress,
         positions=None,
     )
-    image_set = ImageSet(
-        ("",),
-        ChosenImages([image.name for image in images], registered.frames),
-        registered.sequence,
-        registered.first_frame,
-        registered.masks,
-    )
     monkeypatch.setattr(
         "colmap_av1.poses.adjustment_stage.corners_in_images",
         lambda _run, _guide, known: (tracks, known),
@@ -140,7 +137,7 @@ def test_links_join_images_across_a_gap_in_the_tracks(
         cast(Any, run),
         tracks,
         links,
-        image_set,
+        registered.image_set,
         Kept(PosesResult("registered.npz", NUM_IMAGES), "", resumed=False),
         dynamic_masks={},
         masks_digest=None,

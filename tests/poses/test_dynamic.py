@@ -23,10 +23,11 @@ from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.masks import make_mask
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_camera import PosedCamera
+from colmap_av1.geometry.posed_model import PosedModel
 from colmap_av1.geometry.track_points import TriangulatedTracks
 from colmap_av1.geometry.triangulation import Observations, TriangulatedPoints, Views, triangulate
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.image_set import ShownVideo, number_images
+from colmap_av1.images.image_set import ImageSet, ShownVideo, number_images
 from colmap_av1.images.masks import mask_tracks
 from colmap_av1.options import (
     CameraOptions,
@@ -377,17 +378,18 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
         make_mask(np.tile((column < at) | (column >= at + 100), (360, 1))) for at in left.tolist()
     ]
     names = [f"{frame}.png" for frame in frames]
-    registered = PosedImages(
-        images=[
-            ModelImage(frame + 1, name, 7, truth.cam_from_world[frame])
-            for frame, name in enumerate(names)
-        ],
-        frames=frames,
-        sequence=np.zeros(NUM_FRAMES, np.int32),
-        first_frame=np.array([0, every.num_frames]),
-        cameras={7: truth.camera},
-        masks=(None,) * NUM_FRAMES,
+    images = [
+        ModelImage(frame + 1, name, 7, truth.cam_from_world[frame])
+        for frame, name in enumerate(names)
+    ]
+    image_set = ImageSet(
+        ("",),
+        ChosenImages(names, frames),
+        np.zeros(NUM_FRAMES, np.int32),
+        np.array([0, every.num_frames]),
+        tuple(masks),
     )
+    registered = PosedImages(PosedModel({7: truth.camera}, images), image_set)
     inputs: Any = None  # only used by earlier stages
     folder = tmp_path_factory.mktemp("passed")
     shown = (ShownVideo.as_played(video),)
@@ -402,8 +404,11 @@ def passed(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Passed:
     )
     some = DensityOptions(max_tracks_per_image=400, spacing=20.0, min_images=3, max_sigma=0.0)
     cut = mask_tracks(every.keep_frames(frames), dict(enumerate(masks)), 4)
-    registered = registered.masked_by(dict(zip(names, masks, strict=True)))
     return Passed(run, select_tracks(cut, some), registered, left)
+
+
+def with_images(registered: PosedImages, images: list[ModelImage]) -> PosedImages:
+    return replace(registered, model=replace(registered.model, images=images))
 
 
 def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -421,7 +426,9 @@ def off_behind(tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
 
 
 def test_nothing_is_followed_in_a_video_without_registered_images(passed: Passed) -> None:
-    others = replace(passed.registered, sequence=np.ones_like(passed.registered.sequence))
+    image_set = passed.registered.image_set
+    of_another = replace(image_set, sequence=np.ones_like(image_set.sequence))
+    others = replace(passed.registered, image_set=of_another)
     assert follow_occluded(passed.run, passed.tracks, others).num_tracks == 0
 
 
@@ -442,7 +449,7 @@ def test_camera_that_stands_still_gives_no_tracks(passed: Passed) -> None:
     """The pictures of another video may show parallax."""
     pose = passed.registered.images[0].cam_from_world
     still = [replace(image, cam_from_world=pose) for image in passed.registered.images]
-    registered = replace(passed.registered, images=still)
+    registered = with_images(passed.registered, still)
     assert follow_occluded(passed.run, passed.tracks, registered).num_tracks == 0
 
 
@@ -455,7 +462,7 @@ def test_wrong_poses_do_not_continue_tracks_wrongly(passed: Passed, pixels: floa
         for frame, image in enumerate(passed.registered.images)
     ]
     early = passed.tracks.keep_frames(np.arange(20, dtype=np.int32))
-    found = follow_occluded(passed.run, early, replace(passed.registered, images=images))
+    found = follow_occluded(passed.run, early, with_images(passed.registered, images))
     first = np.repeat(found.offsets[:-1], found.lengths)
     late = np.flatnonzero(found.frame >= 20)
     if pixels > 1:  # outside the search window

@@ -60,18 +60,18 @@ def _followed(
     image_of = {int(frame): i for i, frame in enumerate(registered.frames)}
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.shown)):
-        own = np.flatnonzero(registered.sequence == video)
-        if len(own) == 0:
+        own = registered.of_video(video)
+        if len(own.images) == 0:
             continue
-        first = int(registered.first_frame[video])
-        mask_of = {int(registered.frames[i]) - first: registered.masks[i] for i in own}
-        guide = tracks.keep_frames(registered.frames[own])
+        first = int(own.image_set.first_frame[video])
+        mask_of = dict(zip((own.frames - first).tolist(), own.image_set.masks, strict=True))
+        guide = tracks.keep_frames(own.frames)
         num_frames = max(mask_of) + 1
         guide = replace(guide, frame=guide.frame - np.int32(first), num_frames=num_frames)
         decoded = run.shown[video].pictures(
             num_frames, run.options.match.reading, wanted=mask_of, use="corners are followed"
         )
-        report = progress_in(run.progress, "refinement", len(own))
+        report = progress_in(run.progress, "refinement", len(own.images))
         density = _DENSE if len(set(mask_of.values())) > 1 else CornerDensity()
 
         def keep(frame: int, grey: NDArray[np.uint8], first: int = first) -> None:
@@ -92,7 +92,7 @@ def _match_in_all(
 ) -> Tracks:
     """Locate corners in all images that see them, see `match_patches`."""
     found = triangulate_in(run, registered, corners, FROM_PICTURES)
-    views = views_of(registered.images, registered.cameras, registered.masks)
+    views = views_of(registered.images, registered.cameras, registered.image_set.masks)
     report = progress_in(run.progress, "refinement", len(views))
     return match_patches(
         found,
@@ -135,7 +135,7 @@ def resect_from_corners(run: Run, corners: Tracks, registered: PosedImages) -> P
         shown = sightings.rays[own] * focal[i], sightings.xyz[own], float(focal[i])
         if pose is not None and _error(*shown, pose) < _error(*shown, images[i].cam_from_world):
             images[i] = replace(images[i], cam_from_world=pose)
-    return replace(registered, images=images)
+    return replace(registered, model=replace(registered.model, images=images))
 
 
 def _error(

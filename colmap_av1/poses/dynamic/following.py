@@ -58,23 +58,21 @@ def follow_occluded(run: Run, tracks: Tracks, registered: PosedImages) -> Tracks
     """
     found = Tracks.empty(tracks.num_frames, (tracks.width, tracks.height))
     for video in range(len(run.shown)):
-        own = np.flatnonzero(registered.sequence == video)
-        if len(own) == 0:
+        own = registered.of_video(video)
+        if len(own.images) == 0:
             continue
-        frames = registered.frames[own]
-        images = [registered.images[i] for i in own]
-        views = views_of(images, registered.cameras, [registered.masks[i] for i in own])
+        views = views_of(own.images, own.cameras, own.image_set.masks)
         triangulated = triangulate_tracks(
             tracks,
-            frames,
+            own.frames,
             views,
             options=FOR_POSES,
             num_threads=run.context.num_threads,
         )
         if len(triangulated.points.xyz) == 0:  # The camera of this video stands still.
             continue
-        expected, is_expected = expect_in_views(triangulated, views, frames)
-        first_frame = int(registered.first_frame[video])
+        expected, is_expected = expect_in_views(triangulated, views, own.frames)
+        first_frame = int(own.image_set.first_frame[video])
         corrected = _on_pictures(run, video, expected, is_expected, first_frame)
         found = Tracks.concatenate(
             found, corrected.keep_observations(corrected.confirmed | ~is_expected)

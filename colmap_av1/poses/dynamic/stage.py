@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.posed_camera import views_of
@@ -56,9 +55,9 @@ def dynamic_stage(
         found: dict[str, Mask] = {}
         with run.clock.measure("dynamic"):
             for video in range(len(image_set.videos)):
-                own = np.flatnonzero(registered.sequence == video)
-                if len(own) >= _MIN_IMAGES:
-                    found |= _dynamic_masks(run, tracks, registered, own)
+                own = registered.of_video(video)
+                if len(own.images) >= _MIN_IMAGES:
+                    found |= _dynamic_masks(run, tracks, own)
                 run.progress("dynamic", video + 1, len(image_set.videos))
         _write(partial / _FILE, found)
         share = sum(1.0 - mask.share for mask in found.values()) / len(registered.images)
@@ -134,13 +133,10 @@ def _write(path: Path, masks: Mapping[str, Mask]) -> None:
         )
 
 
-def _dynamic_masks(
-    run: Run, tracks: Tracks, registered: PosedImages, own: NDArray[np.intp]
-) -> dict[str, Mask]:
+def _dynamic_masks(run: Run, tracks: Tracks, registered: PosedImages) -> dict[str, Mask]:
     """Masks that exclude dynamic pixels from the images of a video, by image name."""
     num_threads = run.context.num_threads
-    images = [registered.images[i] for i in own]
-    views = views_of(images, registered.cameras)
+    views = views_of(registered.images, registered.cameras)
     size = views[0].size
     cell = _CELL * max(1, round(max(size) / _USUAL_WIDTH))
     spread = DensityOptions(
@@ -151,14 +147,13 @@ def _dynamic_masks(
         max_sigma=0.0,
         wide_tracks=0,
     )
-    frames = registered.frames[own]
     # The limits are loose, so that slightly drifting and slowly moving tracks get points too.
     how = TriangulateOptions(
         max_reprojection_error=float(cell), min_angle=0.0, max_depth_error=None, points="survey"
     )
     found = triangulate_tracks(
-        select_tracks(tracks.keep_frames(frames), spread),
-        frames,
+        select_tracks(tracks.keep_frames(registered.frames), spread),
+        registered.frames,
         views,
         options=how,
         num_threads=num_threads,
@@ -168,7 +163,7 @@ def _dynamic_masks(
     in_cells = tracks_in_cells(found, views, cell)
     cells = dynamic_cells(in_cells, views, num_threads=num_threads)
     return {
-        own_image.name: mask_of_cells(dynamic, cell, size)
-        for own_image, dynamic in zip(images, cells, strict=True)
+        image.name: mask_of_cells(dynamic, cell, size)
+        for image, dynamic in zip(registered.images, cells, strict=True)
         if dynamic.any()
     }

@@ -9,7 +9,7 @@ import numpy as np
 
 from colmap_av1.database.reading import PosePrior
 from colmap_av1.geometry.alignment import transform_poses
-from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
+from colmap_av1.geometry.posed_model import write_posed_model
 from colmap_av1.geometry.undistortion import output_cameras
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.images.positions import ImagePositions
@@ -63,19 +63,20 @@ def place_stage(
             known = _placement_data(run, image_set, registered, positions)
             found, place_warnings = find_placement(registered.images, cameras, known, options, seed)
         write_place(partial, found)
-        images = registered.images
+        model = registered.model
         if found.is_moved:
-            before = np.array([image.cam_from_world for image in images])
+            before = np.array([image.cam_from_world for image in model.images])
             moved = transform_poses(found.similarity, before)
             images = [
                 replace(image, cam_from_world=pose)
-                for image, pose in zip(images, moved, strict=True)
+                for image, pose in zip(model.images, moved, strict=True)
             ]
+            model = replace(model, images=images)
         (partial / file).parent.mkdir()
-        write_posed_model(partial / file, PosedModel(registered.cameras, images))
+        write_posed_model(partial / file, model)
         return PlaceResult(
             poses=Path(file).name,
-            num_registered=len(images),
+            num_registered=len(model.images),
             place=found,
             place_warnings=place_warnings,
         )
