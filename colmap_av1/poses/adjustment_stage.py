@@ -33,7 +33,6 @@ from colmap_av1.poses.posed_images import (
 )
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.seams import model_seams
-from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.poses.zoom import with_own_cameras
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
@@ -128,7 +127,7 @@ def adjustment_stage(
     def make(partial: Path) -> AdjustedResult:
         registered = read_posed_images(run, poses, image_set.masked_by(dynamic_masks))
         # Not kept in a variable: the long tracks need several times the memory of the selection.
-        spread = select_tracks(pose_tracks(run, tracks).keep_frames(registered.frames), _ADJUSTED)
+        spread = select_tracks(run.pose_tracks(tracks).keep_frames(registered.frames), _ADJUSTED)
         if has_picture_positions and has_gaps:
             with run.clock.measure("refinement"):
                 spread = follow_occluded(run, spread, registered)

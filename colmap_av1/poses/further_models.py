@@ -17,11 +17,11 @@ from colmap_av1.poses.estimate_steps import (
     remapped_poses,
     split_at_seams,
 )
+from colmap_av1.poses.mapper import LEAST_IMAGES
 from colmap_av1.poses.mapping_stage import MappedResult
 from colmap_av1.poses.parts import MIN_MODEL_SIZE
 from colmap_av1.poses.posed_images import read_poses
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_stage import LEAST_IMAGES
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.files import remove_leftovers
 from colmap_av1.util.stages import Kept, remove_products, run_stage

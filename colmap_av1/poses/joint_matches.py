@@ -40,7 +40,7 @@ from colmap_av1.poses.matched_observations import (
 from colmap_av1.poses.posed_images import PosedImages, posed_images_of, read_poses, triangulate_in
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_matches import at_same_place, tracks_of_model
-from colmap_av1.poses.track_stage import VideoTracks, pose_tracks
+from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.poses.unregistered import models_of_images, tracks_of_unregistered, within_models
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
@@ -229,7 +229,7 @@ def _model_of(run: Run, estimate: Estimate, image_set: ImageSet) -> _Model:
     assert estimate.adjustment is not None  # `match` always adjusts
     known = read_poses(run, estimate.last)
     registered = posed_images_of(known, image_set)
-    tracks = pose_tracks(run, estimate.tracks).keep_frames(registered.frames)
+    tracks = run.pose_tracks(estimate.tracks).keep_frames(registered.frames)
     return _Model(run, estimate.adjustment.result, known, registered, tracks)
 
 

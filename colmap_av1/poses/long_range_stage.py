@@ -19,7 +19,6 @@ from colmap_av1.poses.posed_images import (
     triangulate_in,
 )
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Floats
 from colmap_av1.util.grouping import groups
@@ -112,6 +111,6 @@ def _compared(
 def _points_by_image(run: Run, tracks: Tracks, registered: PosedImages) -> list[Floats]:
     """Float64 [n, 3] some points that each image observes."""
     some = tracks.every_nth(max(1, tracks.num_tracks // _NUM_TRACKS))
-    points = triangulate_in(run, registered, pose_tracks(run, some), FOR_POSES).model_points()
+    points = triangulate_in(run, registered, run.pose_tracks(some), FOR_POSES).model_points()
     xyz = points.xyz[points.point]
     return [xyz[own] for own in groups(points.image, len(registered.images))]

@@ -28,6 +28,8 @@ from colmap_av1.util.memory import give_back_free_memory
 from colmap_av1.util.processes import bound
 from colmap_av1.util.progress import Progress
 
+# A mapper that finds no initial pair may leave a spurious model of two images.
+LEAST_IMAGES = 3
 # Convergence is slow with a robust loss: steps that lower the cost by less than 0.1 % still reduce
 # the long-range epipolar error.
 ADJUSTMENT_STEPS = 20

@@ -22,12 +22,11 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import CameraOptions, MapOptions
 from colmap_av1.poses.adjusting import refines_intrinsics
 from colmap_av1.poses.longest_tracks import keep_longest_tracks
-from colmap_av1.poses.mapper import MapperEffort, map_poses
+from colmap_av1.poses.mapper import LEAST_IMAGES, MapperEffort, map_poses
 from colmap_av1.poses.match_stage import MatchesResult
 from colmap_av1.poses.posed_images import PosesResult
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.second_distortion import with_second_distortion
-from colmap_av1.poses.track_stage import LEAST_IMAGES
 from colmap_av1.util.digests import digest_of
 from colmap_av1.util.stages import Kept, run_stage
 

@@ -19,8 +19,9 @@ from colmap_av1.matching.match_images import ImageMatches, SelectedTracks, match
 from colmap_av1.matching.matched_images import PairedImages
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.options import DensityOptions
+from colmap_av1.poses.key_images import key_images_of_video
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_stage import VideoTracks, key_images_of_video, pose_tracks, tracks_of
+from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
@@ -70,7 +71,7 @@ def _write_links(folder: Path, found: ImageMatches) -> None:
 def read_links(stages: Path) -> tuple[Tracks, NDArray[np.int32]]:
     """The links as tracks, and the frame before each contradicted gap, which no track crosses."""
     with np.load(stages / _LINKS) as file:
-        return tracks_of(file), file["contradicted"]
+        return Tracks.from_arrays(file), file["contradicted"]
 
 
 def matches_key(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> list[Any]:
@@ -160,7 +161,7 @@ def _key_images(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) ->
     index: list[int] = []
     for video, own in enumerate(videos):
         frames = own.chosen.frames
-        tracks = pose_tracks(run, own.tracks).keep_frames(frames)
+        tracks = run.pose_tracks(own.tracks).keep_frames(frames)
         found = key_images_of_video(run, tracks, own.chosen, own.inter_share, own.fast)
         index += (found + image_set.images_of(video).start).tolist()
     return [*index, *image_set.photos]
@@ -184,7 +185,7 @@ def _selected_tracks(
     selected = []
     for video, own in enumerate(videos):
         with run.clock.measure("pairs"):
-            tracks = pose_tracks(run, own.tracks)
+            tracks = run.pose_tracks(own.tracks)
             sparse = select_tracks(tracks.keep_frames(image_set.of_video(video).frames), density)
         selected.append(SelectedTracks(sparse, own.inter_share, own.fast))
     return selected

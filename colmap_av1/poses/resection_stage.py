@@ -20,7 +20,6 @@ from colmap_av1.poses.posed_images import (
     triangulate_in,
 )
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.progress import progress_in
@@ -58,7 +57,7 @@ def resection_stage(
 
 def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -> list[ModelImage]:
     """The key images with a pose, and the images between them that get one."""
-    seen_thrice = pose_tracks(run, tracks).keep_observed_in(known.frames, _FEWEST_VIEWS)
+    seen_thrice = run.pose_tracks(tracks).keep_observed_in(known.frames, _FEWEST_VIEWS)
     spread = select_tracks(seen_thrice.keep_frames(image_set.images.frames), _RESECTED)
     with_points = triangulate_in(run, known, spread, FOR_POSES)
     check_agreement(len(with_points.points.xyz), with_points.points.num_tracks)

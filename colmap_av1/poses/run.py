@@ -10,6 +10,7 @@ from colmap_av1.images.inputs import Inputs
 from colmap_av1.images.positions import ImagePositions
 from colmap_av1.matching.cameras import ImageCameras
 from colmap_av1.options import ReconstructOptions
+from colmap_av1.tracks.tracks import Tracks, least_length
 from colmap_av1.tracks.video_tracks import VideoSource
 from colmap_av1.util.digests import file_digest
 from colmap_av1.util.progress import Clock, Progress
@@ -63,6 +64,10 @@ class Run:
     def photo_digests(self) -> list[list[str]]:
         """Name and digest of each photo, which stages depend on."""
         return [[photo.name, file_digest(photo.path)] for photo in self.inputs.photos]
+
+    def pose_tracks(self, tracks: Tracks) -> Tracks:
+        """The tracks that poses are estimated from; shorter ones are used for points only."""
+        return tracks.keep_lasting(least_length(self.options.match.tracks))
 
     def pictures(self, image_set: ImageSet) -> Pictures:
         """Reader of the pictures of images, see `pictures_of`."""

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
 from numpy.typing import NDArray
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ImageError, OptionError
 from colmap_av1.geometry.track_points import chaining_for_points
 from colmap_av1.images.choosing import ChosenImages
-from colmap_av1.images.key_images import key_images, spread_images
+from colmap_av1.images.key_images import spread_images
 from colmap_av1.images.names import image_names
 from colmap_av1.images.track_images import (
     ImageChoice,
@@ -23,22 +21,21 @@ from colmap_av1.images.track_images import (
     track_chosen_images,
     track_images,
 )
-from colmap_av1.matching.links.plan import images_to_link
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter, shutter_settings
 from colmap_av1.options import EncodeOptions, RefineOptions, TrackingOptions
+from colmap_av1.poses.key_images import key_images_of_video
+from colmap_av1.poses.mapper import LEAST_IMAGES
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.fast_frames import fast_frames
-from colmap_av1.tracks.tracks import Tracks, least_length
+from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import TrackedVideo, count_frames
-from colmap_av1.util.arrays import Bools, Ints
+from colmap_av1.util.arrays import Bools
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Clock
 from colmap_av1.util.spread import evenly_spread
 from colmap_av1.util.stages import Kept, run_stage
 from colmap_av1.video.unchanged import check_unchanged
 
-# A mapper that finds no initial pair may leave a spurious model of two images.
-LEAST_IMAGES = 3
 # Candidate frames per image of a long video.
 _CANDIDATES = 2
 # Largest number of observations in candidate frames that are held in memory, and the assumed number
@@ -243,35 +240,6 @@ def _spread_in(run: Run, tracked: TrackedVideo, candidates: NDArray[np.int32]) -
     return every.some(spread_images(tracks.subsample_frames(candidates), most, key))
 
 
-def key_images_of_video(
-    run: Run,
-    tracks: Tracks,
-    chosen: ChosenImages,
-    inter_share: NDArray[np.float32],
-    fast: Bools,
-) -> Ints:
-    """Indices of the key images among some images of a video.
-
-    Args:
-        run: the run.
-        tracks: tracks of the video.
-        chosen: the images.
-        inter_share: see `TrackedVideo`.
-        fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
-    """
-    pose_options, links = run.options.poses, run.options.match.links
-    always = images_to_link(inter_share, chosen.frames, links)
-    if links.links != "none":
-        always |= fast[chosen.frames]
-    return key_images(
-        tracks,
-        chosen.frames,
-        always,
-        spacing=pose_options.pose_spacing,
-        num_cells=pose_options.pose_tracks_per_image,
-    )
-
-
 def _check_chosen(run: Run, chosen: ChosenImages, num_frames: int) -> None:
     """Check that there are enough images for a model, and that trainers accept their names."""
     if len(run.sources) == 1 and len(chosen.names) + len(run.inputs.photos) < LEAST_IMAGES:
@@ -288,7 +256,7 @@ def read_tracks(run: Run, video: int, stage: Kept[TracksResult]) -> VideoTracks:
     """The tracks and images of a video that `track_stage` stored."""
     with np.load(run.stages / f"{stage_of_video(run, video)}.npz") as file:
         return VideoTracks(
-            tracks_of(file),
+            Tracks.from_arrays(file),
             ChosenImages([str(name) for name in file["names"]], file["frames"]),
             file["inter_share"],
             file["fast"],
@@ -300,17 +268,4 @@ def read_tracks(run: Run, video: int, stage: Kept[TracksResult]) -> VideoTracks:
 def read_tracks_only(run: Run, video: int) -> Tracks:
     """The tracks of a video that `track_stage` stored, without its images."""
     with np.load(run.stages / f"{stage_of_video(run, video)}.npz") as file:
-        return tracks_of(file)
-
-
-def tracks_of(file: Any) -> Tracks:
-    """The tracks in a file of `np.savez`."""
-    arrays = {field.name: file[field.name] for field in dataclasses.fields(Tracks)}
-    for name in ("num_frames", "width", "height"):
-        arrays[name] = int(arrays[name])
-    return Tracks(**arrays)
-
-
-def pose_tracks(run: Run, tracks: Tracks) -> Tracks:
-    """The tracks that poses are estimated from; shorter ones are used for points only."""
-    return tracks.keep_lasting(least_length(run.options.match.tracks))
+        return Tracks.from_arrays(file)

@@ -11,7 +11,6 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import DensityOptions
 from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_stage import pose_tracks
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Ints
@@ -41,7 +40,7 @@ def tracks_of_unregistered(
             estimate.tracks.num_frames, (estimate.tracks.width, estimate.tracks.height)
         )
     frames, frame_of = image_set.images.frames, image_set.images.frame_of
-    motion = select_tracks(pose_tracks(run, estimate.tracks).keep_frames(frames), density)
+    motion = select_tracks(run.pose_tracks(estimate.tracks).keep_frames(frames), density)
     seen = Tracks.concatenate(motion, estimate.link_tracks.keep_frames(frames))
     is_wanted = np.isin(seen.frame, [frame_of[name] for name in not_registered])
     return seen.keep_tracks(seen.having(is_wanted))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -94,6 +94,14 @@ class Tracks:
             sigma=np.empty(0, np.float32),
             confirmed=np.empty(0, np.bool_),
         )
+
+    @staticmethod
+    def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Tracks:
+        """Tracks from the arrays that `np.savez` makes of the attributes, by their names."""
+        values: dict[str, Any] = {field.name: arrays[field.name] for field in fields(Tracks)}
+        for name in ("num_frames", "width", "height"):
+            values[name] = int(values[name])
+        return Tracks(**values)
 
     @staticmethod
     def concatenate(first: Tracks, *others: Tracks) -> Tracks:

@@ -21,8 +21,8 @@ from colmap_av1.options import PoseOptions
 from colmap_av1.poses.adjustment_stage import adjustment_stage
 from colmap_av1.poses.corners.in_images import resect_from_corners
 from colmap_av1.poses.posed_images import PosedImages, PosesResult
+from colmap_av1.poses.run import Run
 from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.progress import Clock, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import Kept
 
@@ -121,20 +121,14 @@ def test_links_join_images_across_a_gap_in_the_tracks(
     links = seen.keep_observations((number % 4 == 3) & (np.abs(seen.frame - joint) <= 3))
     write_posed_model(tmp_path / "registered.npz", PosedModel(registered.cameras, images))
     options = ReconstructOptions(poses=PoseOptions(refine_intrinsics=False))
-    run = SimpleNamespace(
-        options=options,
-        stages=tmp_path,
-        context=RunContext(),
-        clock=Clock(),
-        progress=no_progress,
-        positions=None,
-    )
+    inputs: Any = None  # only used by earlier stages
+    run = Run(inputs, (), (), tmp_path, tmp_path, options, RunContext())
     monkeypatch.setattr(
         "colmap_av1.poses.adjustment_stage.corners_in_images",
         lambda _run, _guide, known: (tracks, known),
     )
     adjusted = adjustment_stage(
-        cast(Any, run),
+        run,
         tracks,
         links,
         registered.image_set,
