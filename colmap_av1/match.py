@@ -694,22 +694,14 @@ def _correct_rolling_shutter(
     prepared: PreparedImages, options: MatchOptions, context: RunContext
 ) -> PreparedImages:
     """The images with their tracks corrected for the rolling shutter, if requested."""
-    tracked = prepared.tracked
-    corrected = correct_rolling_shutter(
-        tracked.tracks,
-        prepared.shown.display,
+    video = correct_rolling_shutter(
+        prepared.tracked.video,
+        prepared.shown,
         prepared.source.pictures.frame_rate,
         options.camera,
         context,
-        pixel_aspect=prepared.shown.pixel_aspect,
     )
-    video = replace(
-        tracked.video,
-        tracks=corrected.tracks,
-        read_out=corrected.read_out,
-        warnings=(*tracked.video.warnings, *corrected.warnings),
-    )
-    return replace(prepared, tracked=replace(tracked, video=video))
+    return replace(prepared, tracked=replace(prepared.tracked, video=video))
 
 
 def _with_selected_tracks(

@@ -111,7 +111,7 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
         options.tracks, run.options.triangulate, is_downscaled=source.is_downscaled
     )
     tracking = replace(options.tracking, tracks=chaining)
-    name, shown = stage_of_video(run, video), source.pictures
+    name = stage_of_video(run, video)
     count = 0 if options.images.ways else count_frames(source, options.read)
     is_long = count > run.options.max_images
 
@@ -127,16 +127,15 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
                 every_frame=options.camera.needs_every_frame,
                 context=run.context,
             )
-        chosen, tracked = found.chosen, found.video
-        corrected = correct_rolling_shutter(
-            tracked.tracks,
-            shown.display,
-            shown.frame_rate,
+        chosen = found.chosen
+        tracked = correct_rolling_shutter(
+            found.video,
+            run.shown[video],
+            source.pictures.frame_rate,
             options.camera,
             run.context,
-            pixel_aspect=shown.display.pixel_aspect,
         )
-        tracks = corrected.tracks
+        tracks = tracked.tracks
         if is_long:  # Later stages need no other frames of a long video.
             tracks = tracks.keep_frames(chosen.frames)
         _check_chosen(run, chosen, tracks.num_frames)
@@ -151,10 +150,10 @@ def track_stage(run: Run, video: int) -> Kept[TracksResult]:
             )
         check_unchanged(*source.files)
         return TracksResult(
-            tracks.num_frames,
-            tracks.num_tracks,
-            corrected.read_out,
-            (*tracked.warnings, *corrected.warnings),
+            num_frames=tracks.num_frames,
+            num_tracks=tracks.num_tracks,
+            read_out=tracked.read_out,
+            warnings=tracked.warnings,
         )
 
     pose_options = run.options.poses

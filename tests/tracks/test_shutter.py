@@ -23,6 +23,7 @@ from colmap_av1 import (
     reconstruct,
 )
 from colmap_av1.cli import main
+from colmap_av1.images.orientation import ShownImages
 from colmap_av1.matching.shutter import of_video
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter, rows_down
 from colmap_av1.matching.shutter.estimate import ReadOut, estimate_read_out
@@ -138,30 +139,24 @@ def test_rows_follow_the_orientation_of_the_sensor() -> None:
 
 def test_rolling_shutter_option() -> None:
     tracks = tracks_of(0.45)
+    video = TrackedVideo(tracks, NUM_FRAMES, np.ones(NUM_FRAMES, np.float32), ())
+    shown = ShownImages(Display(), (WIDTH, HEIGHT), (WIDTH, HEIGHT))
     for wanted, found in (("none", None), ("15", 15.0), ("-7.5", -7.5)):
-        options = MatchOptions(camera=CameraOptions(rolling_shutter=wanted))
-        corrected = correct_rolling_shutter(
-            tracks, Display(), RATE, options.camera, RunContext(), pixel_aspect=1.0
-        )
+        camera = CameraOptions(rolling_shutter=wanted)
+        corrected = correct_rolling_shutter(video, shown, RATE, camera, RunContext())
         assert corrected.read_out == pytest.approx(found)
         assert (corrected.tracks is tracks) == (found is None)
         assert not corrected.warnings
-    options = MatchOptions(
-        camera=CameraOptions(
-            rolling_shutter="estimate",
-            camera_model="SIMPLE_PINHOLE",
-            camera_params=f"{FOCAL},{WIDTH / 2},{HEIGHT / 2}",
-        )
+    estimated = CameraOptions(
+        rolling_shutter="estimate",
+        camera_model="SIMPLE_PINHOLE",
+        camera_params=f"{FOCAL},{WIDTH / 2},{HEIGHT / 2}",
     )
-    corrected = correct_rolling_shutter(
-        tracks, Display(), RATE, options.camera, RunContext(), pixel_aspect=1.0
-    )
+    corrected = correct_rolling_shutter(video, shown, RATE, estimated, RunContext())
     assert corrected.read_out == pytest.approx(15, abs=1.5)
     fisheye = CameraOptions(rolling_shutter="estimate", camera_model="OPENCV_FISHEYE")
-    for rate, camera, word in ((None, options.camera, "rate"), (RATE, fisheye, "fisheye")):
-        unknown = correct_rolling_shutter(
-            tracks, Display(), rate, camera, RunContext(), pixel_aspect=1.0
-        )
+    for rate, camera, word in ((None, estimated, "rate"), (RATE, fisheye, "fisheye")):
+        unknown = correct_rolling_shutter(video, shown, rate, camera, RunContext())
         assert unknown.tracks is tracks
         assert unknown.read_out is None
         assert word in unknown.warnings[0]

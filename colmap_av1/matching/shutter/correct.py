@@ -2,64 +2,61 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 from colmap_av1.geometry.cameras import is_nearly_pinhole, is_square
+from colmap_av1.images.orientation import ShownImages
 from colmap_av1.matching.shutter.estimate import estimate_read_out
 from colmap_av1.options import CameraOptions
 from colmap_av1.options.camera import DEFAULT_MODEL, camera_of_model, parse_camera_params
 from colmap_av1.tracks.shutter import correct_tracks
 from colmap_av1.tracks.tracks import Tracks
+from colmap_av1.tracks.video_tracks import TrackedVideo
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.display import UPRIGHT, Display
 
 
-@dataclass(frozen=True)
-class ShutterCorrection:
-    """Tracks that are corrected for a rolling shutter as far as possible.
-
-    Attributes:
-        tracks: the tracks.
-        read_out: the read-out time in milliseconds; None if nothing is corrected.
-        warnings: why nothing is corrected although it was requested.
-    """
-
-    tracks: Tracks
-    read_out: float | None = None
-    warnings: tuple[str, ...] = ()
-
-
 def correct_rolling_shutter(
-    tracks: Tracks,
-    display: Display,
-    rate: float | None,
+    video: TrackedVideo,
+    shown: ShownImages,
+    frame_rate: float | None,
     camera: CameraOptions,
     context: RunContext,
-    *,
-    pixel_aspect: float,
-) -> ShutterCorrection:
-    """Move tracks to their positions in the middle of each picture's read-out.
+) -> TrackedVideo:
+    """Move tracks to their positions in the middle of each picture's read-out, if requested.
 
     Args:
-        tracks: tracks of all frames; neighbouring observations give their velocities.
-        display: how players show the pictures.
-        rate: frames per second; None if unknown.
+        video: tracks of all frames; neighbouring observations give their velocities.
+        shown: how the pictures are shown whose pixels the tracks are in.
+        frame_rate: frames per second; None if unknown.
         camera: the read-out time, the model and given intrinsics.
         context: its clock gets the stage "shutter".
-        pixel_aspect: width over height of the pixels that tracks are in.
+
+    Returns:
+        The video with corrected tracks and their read-out time, or with a warning if they cannot be
+        corrected.
     """
+    tracks = video.tracks
     if camera.rolling_shutter == "none" or tracks.num_frames == 0:
-        return ShutterCorrection(tracks)
+        return video
     with context.clock.measure("shutter"):
-        down = rows_down(display, (tracks.width, tracks.height))
+        down = rows_down(shown.display, (tracks.width, tracks.height))
         found = _read_out(
-            tracks, rate, camera, down=down, pixel_aspect=pixel_aspect, seed=context.seed
+            tracks,
+            frame_rate,
+            camera,
+            down=down,
+            pixel_aspect=shown.pixel_aspect,
+            seed=context.seed,
         )
-        if rate is None or isinstance(found, str):
-            return ShutterCorrection(
-                tracks, warnings=(f"keypoints are not corrected for a rolling shutter: {found}",)
-            )
-        return ShutterCorrection(correct_tracks(tracks, found, down), found / rate * 1000)
+        if frame_rate is None or isinstance(found, str):
+            warning = f"keypoints are not corrected for a rolling shutter: {found}"
+            return replace(video, warnings=(*video.warnings, warning))
+        return replace(
+            video,
+            tracks=correct_tracks(tracks, found, down),
+            read_out=found / frame_rate * 1000,
+        )
 
 
 def _read_out(
