@@ -6,22 +6,17 @@ import os
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from colmap_av1.database.listed import check_no_camera, listed_cameras, listed_of_videos
 from colmap_av1.database.reading import DatabaseImage, read_images
 from colmap_av1.database.writing import check_writable, write_matches
 from colmap_av1.errors import DatabaseError, ModelError, OptionError, VideoError
-from colmap_av1.geometry.cameras import (
-    check_pixel_aspect,
-    focal_length_warning,
-    with_known_focal_lengths,
-)
+from colmap_av1.geometry.cameras import check_pixel_aspect, focal_length_warning
 from colmap_av1.images.files import alone_in, files_in
 from colmap_av1.images.image_set import ImageSet, ShownVideo, pictures_of
 from colmap_av1.images.inputs import Inputs, read_inputs
@@ -32,11 +27,10 @@ from colmap_av1.images.recognising import check_content, frames_near
 from colmap_av1.images.track_images import MIN_IMAGES
 from colmap_av1.matching.cameras import ImageCameras, new_cameras
 from colmap_av1.matching.few_matches import matching_warning
-from colmap_av1.matching.initial_pairs import PreparedStart, prepare_start
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.matching.mapper_limits import FORWARD_MOTION, SMALL_ANGLES
 from colmap_av1.matching.match_images import ImageMatches, SelectedTracks, match_images
-from colmap_av1.matching.matched_images import MatchedImages, PairedImages
+from colmap_av1.matching.matched_images import PairedImages
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter
 from colmap_av1.options import (
     DensifyOptions,
@@ -49,7 +43,7 @@ from colmap_av1.options import (
 from colmap_av1.options.fields import Options
 from colmap_av1.options.words import words_of
 from colmap_av1.poses.joint_matches import JointEstimate, JointMatches, match_jointly
-from colmap_av1.poses.mapper_trials import demote_failing_starts
+from colmap_av1.poses.mapper_start import choose_mapper_start
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_stage import VideoTracks, encoding_for_pictures
 from colmap_av1.tracks.selection import select_tracks
@@ -57,7 +51,7 @@ from colmap_av1.tracks.video_tracks import decodable_frames
 from colmap_av1.util.arrays import Ints
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import STAGES, check_outside, scratch_folder
-from colmap_av1.util.progress import Clock, Progress, no_progress
+from colmap_av1.util.progress import Progress, no_progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.kept_pictures import KeptPictures
 from colmap_av1.video.unchanged import unchanged
@@ -277,24 +271,9 @@ def match(
         )
         cameras = _listed_cameras(database, listed, images) if listed else None
         found = _match_images(images, cameras, scratch, options, context)
-        joint = found if isinstance(found, JointMatches) else None
-        is_assumed = _has_assumed_focal_length(found)
-        # The poses of pairs are wrong if a focal length is assumed.
-        known = joint.poses if joint is not None and not is_assumed else ()
-        start = prepare_start(found.matched, found.cameras, clock, known)
-        # The estimate does not change the cameras of an existing database.
-        is_undetermined = cameras is None and joint is not None and is_assumed
-        is_known_ahead = start.limits == FORWARD_MOTION and not is_assumed
         names = images.image_set.images.names
-        started = _choose_mapper_start(
-            start,
-            names,
-            found,
-            clock,
-            fixed_intrinsics=is_known_ahead,
-            is_undetermined=is_undetermined,
-        )
-        written = started.matched
+        start = choose_mapper_start(found, names, clock, keep_cameras=cameras is not None)
+        written = start.matched
         num_written, blurred = 0, list[str]()
         if folder is not None:
             check_videos()
@@ -310,16 +289,17 @@ def match(
         write_matches(
             database,
             names,
-            None if listed else started.cameras,
+            None if listed else start.cameras,
             written,
             on_existing=options.on_existing,
             places=positions.places,
         )
+    joint = found if isinstance(found, JointMatches) else None
     videos = images.videos
     kinds = Counter(geometry.config.name for geometry in written.geometries)
     num_inliers = written.num_inliers
     notes = inputs.with_names([own.tracked.video.warnings for own in videos])
-    notes += (*positions.warnings, *found.warnings, *started.warnings)
+    notes += (*positions.warnings, *found.warnings, *start.warnings)
     doubts = [found.depth.warning, focal_length_warning(found.cameras)]
     # Few matches do not mean a gap if existing matches of the database may connect the images, or
     # with a joint estimate, which omits matches that only repeat tracks of other pairs.
@@ -351,7 +331,7 @@ def match(
         configs=dict(sorted(kinds.items())),
         forward_motion=start.limits == FORWARD_MOTION,
         small_angles=start.limits == SMALL_ANGLES,
-        fixed_intrinsics=started.fixed_intrinsics,
+        fixed_intrinsics=start.fixed_intrinsics,
         links=found.links,
         estimate=joint.estimate if joint is not None else None,
         seconds=clock.seconds,
@@ -524,88 +504,6 @@ def _match_images(
         return found
     warning = f"matches are verified pair by pair, without a joint estimate: {reason}"
     return replace(found, warnings=(*found.warnings, warning))
-
-
-@dataclass(frozen=True)
-class _MapperStart:
-    """What COLMAP's incremental mapper starts from.
-
-    Attributes:
-        matched: the images with their matches.
-        cameras: the camera of each image.
-        fixed_intrinsics: see `MatchReport`.
-        warnings: problems with the mapper or the cameras.
-    """
-
-    matched: MatchedImages
-    cameras: Sequence[pycolmap.Camera]
-    fixed_intrinsics: bool
-    warnings: tuple[str, ...] = ()
-
-
-def _choose_mapper_start(
-    start: PreparedStart,
-    names: Sequence[str],
-    found: ImageMatches,
-    clock: Clock,
-    *,
-    fixed_intrinsics: bool,
-    is_undetermined: bool,
-) -> _MapperStart:
-    """Choose pairs, cameras and fixed intrinsics so that the mapper starts a large model.
-
-    If the joint estimate does not determine the intrinsics, the mapper refines the default ones if
-    a large model then grows, and otherwise keeps them.
-
-    Args:
-        start: the images, and the mapper's limits of the initial pair.
-        names: names of the images.
-        found: the matches and cameras.
-        clock: gets the stage "verification".
-        fixed_intrinsics: whether the mapper keeps the intrinsics.
-        is_undetermined: whether the joint estimate does not determine the intrinsics.
-    """
-    cameras, known = found.cameras, with_known_focal_lengths(found.cameras)
-    # Without depth, there is no good start.
-    is_tried = start.is_tried or not found.depth.is_observable
-    warnings = []
-    if is_undetermined:
-        with suppress(ModelError):
-            matched = demote_failing_starts(start, names, cameras, clock, is_assumed=True)
-            if matched is not None:
-                return _MapperStart(matched, cameras, fixed_intrinsics=False)
-        warnings.append(
-            "the images hardly determine the focal length, so the mapper keeps a default that may "
-            "be far off: give the intrinsics by --camera_params if you know them"
-        )
-        # The mapper keeps the default intrinsics only if they count as known.
-        cameras, fixed_intrinsics = known, True
-    matched = None
-    try:
-        if not is_tried:
-            matched = demote_failing_starts(
-                start, names, known, clock, fixed_intrinsics=fixed_intrinsics
-            )
-    except ModelError:
-        warnings.append(
-            "COLMAP's mapper failed in a trial on this database, and may fail again: if so, its "
-            "output tells why"
-        )
-    return _MapperStart(matched or start.matched, cameras, fixed_intrinsics, tuple(warnings))
-
-
-def _has_assumed_focal_length(found: ImageMatches) -> bool:
-    """Whether the focal length of an image is assumed.
-
-    With a joint estimate, images that it does not register do not count.
-    """
-    models = found.poses if isinstance(found, JointMatches) else [found.cameras]
-    return any(
-        not camera.has_prior_focal_length
-        for images in models
-        for camera, image in zip(found.cameras, images, strict=True)
-        if image is not None
-    )
 
 
 def _has_several_cameras(image_set: ImageSet, cameras: ImageCameras) -> bool:

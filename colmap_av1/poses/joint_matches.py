@@ -110,6 +110,16 @@ class JointMatches(ImageMatches):
     estimate: JointEstimate
     poses: list[list[Floats | None]]
 
+    @property
+    def assumes_focal_length(self) -> bool:
+        """Whether the focal length of a registered image is assumed."""
+        return not all(
+            camera.has_prior_focal_length
+            for poses in self.poses
+            for camera, pose in zip(self.cameras, poses, strict=True)
+            if pose is not None
+        )
+
 
 def match_jointly(
     run: Run,
