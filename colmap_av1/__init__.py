@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from colmap_av1.evaluate.report.results import CompareReport
     from colmap_av1.interop.hloc import HlocMatches, export_hloc, read_hloc
     from colmap_av1.map import MapReport, map_database
-    from colmap_av1.match import MatchReport, match
+    from colmap_av1.match import match
+    from colmap_av1.match_report import MatchReport
     from colmap_av1.motion.frame_motion import FrameMotion
     from colmap_av1.motion.info import StreamReport, read_info
     from colmap_av1.motion.motion_file import export_motion
@@ -153,7 +154,7 @@ _MODULES = {
     "FurtherModel": "splats.reconstruct_models",
     "HlocMatches": "interop.hloc",
     "MapReport": "map",
-    "MatchReport": "match",
+    "MatchReport": "match_report",
     "ModelCheck": "check.model",
     "ReconstructReport": "reconstruct",
     "StreamReport": "motion.info",

@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # these modules are slow to import
     from colmap_av1.densify import DensifyReport
     from colmap_av1.evaluate.report.results import CompareReport
     from colmap_av1.map import MapReport
-    from colmap_av1.match import MatchReport
+    from colmap_av1.match_report import MatchReport
     from colmap_av1.matching.links.report import LinkReport
     from colmap_av1.matching.shutter.of_video import VideoReadOut
     from colmap_av1.motion.info import StreamReport

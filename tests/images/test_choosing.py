@@ -25,7 +25,8 @@ from colmap_av1.images.choosing import (
     spread_in_parallax,
 )
 from colmap_av1.images.parallax import parallax
-from colmap_av1.match import MatchReport, match
+from colmap_av1.match import match
+from colmap_av1.match_report import MatchReport
 from colmap_av1.motion.reading import frame_times
 from colmap_av1.options import DensityOptions, ImageOptions, MatchOptions, VerifyOptions
 from colmap_av1.tracks.tracks import Tracks

@@ -25,7 +25,8 @@ from colmap_av1.check.database import check_database
 from colmap_av1.database.reading import image_ids_from_pair_id
 from colmap_av1.errors import VideoError
 from colmap_av1.geometry.colmap_model import camera_centres
-from colmap_av1.match import MatchReport, match
+from colmap_av1.match import match
+from colmap_av1.match_report import MatchReport
 from colmap_av1.matching.features.retrieval import similar_images
 from colmap_av1.matching.features.sift import Features, extract_features, match_features
 from colmap_av1.matching.links.matching import Links

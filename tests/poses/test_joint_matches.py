@@ -23,7 +23,8 @@ from colmap_av1.database.reading import read_cameras
 from colmap_av1.errors import ModelError, OptionError, VideoError
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import ModelImage, read_model
-from colmap_av1.match import MatchReport, match
+from colmap_av1.match import match
+from colmap_av1.match_report import MatchReport
 from colmap_av1.options import (
     CameraOptions,
     DensityOptions,
