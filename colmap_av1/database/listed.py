@@ -1,4 +1,4 @@
-"""Images that already exist in a database: the video that each belongs to, and their cameras."""
+"""Images that a database already lists: the video that each belongs to, and their cameras."""
 
 from __future__ import annotations
 
@@ -8,10 +8,42 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_av1.database.reading import DatabaseImage, read_cameras
+from colmap_av1.database.reading import DatabaseImage, read_cameras, read_images
+from colmap_av1.database.writing import check_writable
 from colmap_av1.errors import DatabaseError, OptionError
+from colmap_av1.geometry.cameras import check_pixel_aspect
 from colmap_av1.images.inputs import Inputs
-from colmap_av1.options import CameraOptions
+from colmap_av1.images.preparing import PreparedInputs
+from colmap_av1.matching.cameras import ImageCameras
+from colmap_av1.options import CameraOptions, OnExisting
+
+
+def read_listed_images(
+    database: Path, on_existing: OnExisting, camera: CameraOptions
+) -> list[DatabaseImage]:
+    """Read the images that a database lists, and check that it can be written.
+
+    Args:
+        database: path of the database, which need not exist.
+        on_existing: what to do if the images have keypoints or matches.
+        camera: camera options, which must not be given if there are images.
+
+    Raises:
+        DatabaseError: the database cannot be written, or its images have keypoints or matches,
+            which `on_existing` does not allow.
+        OptionError: the images already have cameras.
+    """
+    check_writable(database)
+    listed = read_images(database)
+    filled = next((i for i in listed if i.num_keypoints or i.num_matches), None)
+    if filled is not None and on_existing == "error":
+        raise DatabaseError(
+            f"{database}: image '{filled.name}' already has {filled.num_keypoints} keypoints and "
+            f"{filled.num_matches} matches: --on_existing append adds to them, replace removes them"
+        )
+    if listed:
+        _check_no_camera(database, camera)
+    return listed
 
 
 def listed_of_videos(
@@ -79,7 +111,30 @@ def listed_cameras(
     return [cameras[camera_id[name]] for name in names]
 
 
-def check_no_camera(database: Path, options: CameraOptions) -> None:
+def listed_image_cameras(
+    database: Path, listed: Sequence[DatabaseImage], prepared: PreparedInputs
+) -> ImageCameras:
+    """The cameras that the database holds for prepared images.
+
+    Args:
+        database: the database.
+        listed: its images.
+        prepared: these images, prepared.
+    """
+    image_set, inputs = prepared.image_set, prepared.inputs
+    cameras = listed_cameras(database, listed, image_set.images.names)
+    warnings = [
+        check_pixel_aspect(
+            cameras[image_set.images_of(video).start],
+            own.shown.pixel_aspect,
+            "import the images with one of these",
+        )
+        for video, own in enumerate(prepared.videos)
+    ]
+    return ImageCameras(cameras, None, tuple(inputs.with_names(warnings)))
+
+
+def _check_no_camera(database: Path, options: CameraOptions) -> None:
     """Refuse camera options if the existing images already have cameras.
 
     Raises:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.images.blur import blur_warning
 from colmap_av1.images.choosing import check_frame_list, existing_images
 from colmap_av1.images.files import check_image_folder, check_images_there, image_size, write_images
+from colmap_av1.images.image_set import ImageSet, ShownVideo
+from colmap_av1.images.inputs import Inputs
 from colmap_av1.images.masks import VideoMasks
 from colmap_av1.images.names import names_of_all
 from colmap_av1.images.orientation import ShownImages, shown_images
+from colmap_av1.images.photos import copy_photos
 from colmap_av1.images.recognising import check_content, frames_near
 from colmap_av1.images.track_images import (
     ImageChoice,
@@ -20,9 +23,16 @@ from colmap_av1.images.track_images import (
     decode_pictures,
     track_chosen_images,
 )
-from colmap_av1.options import CameraOptions, ImageOptions, MatchOptions, ReadOptions
+from colmap_av1.options import (
+    CameraOptions,
+    DensityOptions,
+    ImageOptions,
+    MatchOptions,
+    ReadOptions,
+)
+from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.video_tracks import VideoSource, open_source
-from colmap_av1.util.progress import Progress
+from colmap_av1.util.progress import Clock, Progress
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.video.facts import Video, count_shown
 from colmap_av1.video.unchanged import unchanged
@@ -47,6 +57,41 @@ class PreparedImages:
     shown: ShownImages
     tracked: TrackedImages
     existed: bool
+
+    def with_selected_tracks(self, density: DensityOptions, clock: Clock) -> PreparedImages:
+        """Keep only the tracks in the images that are selected for matching.
+
+        Args:
+            density: which tracks are selected.
+            clock: gets the stage "pairs".
+        """
+        tracked = self.tracked
+        with clock.measure("pairs"):
+            tracks = select_tracks(tracked.tracks.keep_frames(tracked.chosen.frames), density)
+        return replace(self, tracked=tracked.with_tracks(tracks))
+
+
+@dataclass(frozen=True)
+class PreparedInputs:
+    """The images of all videos and photos before matching.
+
+    Attributes:
+        inputs: the videos and photos.
+        videos: the images of each video.
+        image_set: all images, numbered consecutively.
+    """
+
+    inputs: Inputs
+    videos: Sequence[PreparedImages]
+    image_set: ImageSet
+
+    @property
+    def shown(self) -> tuple[ShownVideo, ...]:
+        """The videos, whose pictures are shown in the size of the images."""
+        return tuple(
+            ShownVideo.in_images(own.shown, own.source.pictures, own.source.kept)
+            for own in self.videos
+        )
 
 
 def check_fit(
@@ -125,28 +170,42 @@ def prepare_images(
             every_frame=options.camera.needs_every_frame,
             context=context,
         )
-    if folder is not None:
-        names, frames = found.chosen.names, found.chosen.frames.tolist()
-        check_image_folder(folder, names, size)
-        kept = [(n, f) for n, f in zip(names, frames, strict=True) if (folder / n).exists()]
-        if not existing and kept:
-            # Another program may have numbered other frames than the pattern does.
-            some = dict([kept[0], kept[min(_CHECKED, len(kept) - 1)]])
-            pictures = decode_pictures(
-                source,
-                found.tracks.num_frames,
-                options.reading,
-                shown.display,
-                wanted=frames_near(some.values()),
-                context=context,
-            )
-            check_content([folder / name for name in some], list(some.values()), pictures)
-    return PreparedImages(
+    prepared = PreparedImages(
         source=source,
         shown=shown,
         tracked=found.with_tracks(found.tracks.scale_to(size)),
         existed=bool(existing),
     )
+    if folder is not None:
+        names, frames = found.chosen.names, found.chosen.frames.tolist()
+        check_image_folder(folder, names, size)
+        files = [(folder / name, frame) for name, frame in zip(names, frames, strict=True)]
+        kept = [(file, frame) for file, frame in files if file.exists()]
+        if not existing and kept:
+            # Another program may have numbered other frames than the pattern does.
+            some = [kept[0], kept[min(_CHECKED, len(kept) - 1)]]
+            _check_content(prepared, dict(some), options.reading, context)
+    return prepared
+
+
+def _check_content(
+    prepared: PreparedImages, frame_of: Mapping[Path, int], read: ReadOptions, context: RunContext
+) -> None:
+    """Check that image files show their frames of the video, given in ascending order.
+
+    Raises:
+        ImageError: an image shows something else.
+    """
+    files, frames = list(frame_of), list(frame_of.values())
+    pictures = decode_pictures(
+        prepared.source,
+        prepared.tracked.tracks.num_frames,
+        read,
+        prepared.shown.display,
+        wanted=frames_near(frames),
+        context=context,
+    )
+    check_content(files, frames, pictures)
 
 
 def write_prepared(
@@ -178,25 +237,42 @@ def write_prepared(
 
 
 def write_all_prepared(
-    videos: Iterable[tuple[str, PreparedImages]],
+    prepared: PreparedInputs,
     folder: Path,
     read: ReadOptions,
-    progress: Progress,
+    context: RunContext,
+    *,
+    before: Collection[Path],
 ) -> tuple[int, list[str]]:
-    """Write the images of videos, see `write_prepared`.
+    """Write the images of videos, see `write_prepared`, and copy the photos.
 
     Args:
-        videos: the subfolder of each video's images, and the prepared images.
+        prepared: the images.
         folder: folder for all images.
         read: how the videos are decoded.
-        progress: called in the stage "images".
+        context: its progress is called in the stages "images" and "recognising".
+        before: files in the folder when this run began.
 
     Returns:
-        The number of images written, and warnings about the images.
+        The number of images and photos written, and warnings about the images.
+
+    Raises:
+        ImageError: another run has written images since this one began, of another video.
     """
-    num_written, warnings = 0, list[str]()
-    for label, own in videos:
-        num_written += write_prepared(own, folder / label, read, progress)
-        warning = blur_warning([folder / label / name for name in own.tracked.chosen.names])
+    of_videos = [
+        (own, folder / label)
+        for own, label in zip(prepared.videos, prepared.inputs.labels, strict=True)
+    ]
+    for own, own_folder in of_videos:
+        chosen = own.tracked.chosen
+        for name, frame in zip(chosen.names, chosen.frames.tolist(), strict=True):
+            path = own_folder / name
+            if path not in before and path.exists():
+                _check_content(own, {path: frame}, read, context)
+                break
+    num_written, warnings = copy_photos(prepared.inputs.photos, folder), list[str]()
+    for own, own_folder in of_videos:
+        num_written += write_prepared(own, own_folder, read, context.progress)
+        warning = blur_warning([own_folder / name for name in own.tracked.chosen.names])
         warnings += [warning] if warning is not None else []
     return num_written, warnings

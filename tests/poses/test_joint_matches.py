@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -155,7 +154,7 @@ def test_error_of_a_requested_joint_estimate_says_what_to_do(
     def fail(*_: object, **__: object) -> None:
         raise ModelError("the mapper stopped with status 3: see scratch/mapper.log")
 
-    monkeypatch.setattr(sys.modules[match.__module__], "match_jointly", fail)
+    monkeypatch.setattr("colmap_av1.poses.match_prepared.match_jointly", fail)
     options = replace(OPTIONS, verify=VerifyOptions(verify="joint"))
     with pytest.raises(ModelError, match="--verify") as raised:
         match(tmp_path / "a.db", scene, image_path=joint.image_path, options=options)

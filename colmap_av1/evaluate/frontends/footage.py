@@ -13,7 +13,6 @@ from colmap_av1.images.preparing import PreparedImages, prepare_images, write_pr
 from colmap_av1.matching.matched_images import pair_by_tracks, verify_images
 from colmap_av1.matching.pairs import schedule_pairs
 from colmap_av1.options import CameraOptions, DensityOptions, MatchOptions, PairOptions
-from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.video_tracks import open_source
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Progress, no_progress
@@ -199,12 +198,10 @@ def frame_list(footage: Footage, path: Path) -> str:
 
 def _is_forward_motion(prepared: PreparedImages, options: MatchOptions) -> bool:
     """Whether the camera moves along its optical axis."""
-    tracks, chosen = prepared.tracked.tracks, prepared.tracked.chosen
-    observed = tracks.keep_frames(chosen.frames)
     camera = make_camera(options.camera, *prepared.shown.size, prepared.shown.pixel_aspect)
     context = RunContext.of(options.run)
-    tracks = select_tracks(observed, DensityOptions(preset="sparse"))
+    sparse = prepared.with_selected_tracks(DensityOptions(preset="sparse"), context.clock).tracked
     choose = partial(schedule_pairs, options=PairOptions(offsets=(1,), growth=1.0))
-    paired = pair_by_tracks(tracks, chosen.frames, choose)
+    paired = pair_by_tracks(sparse.tracks, sparse.chosen.frames, choose)
     cameras = [camera] * len(paired.keypoints)
     return verify_images(paired, cameras, options.verify, context).forward_motion
