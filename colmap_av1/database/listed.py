@@ -114,12 +114,12 @@ def listed_cameras(
 def listed_image_cameras(
     database: Path, listed: Sequence[DatabaseImage], prepared: PreparedInputs
 ) -> ImageCameras:
-    """The cameras that the database holds for prepared images.
+    """The cameras that the database holds for its images, and warnings about their pixels.
 
     Args:
         database: the database.
         listed: its images.
-        prepared: these images, prepared.
+        prepared: the same images, prepared for matching.
     """
     image_set, inputs = prepared.image_set, prepared.inputs
     cameras = listed_cameras(database, listed, image_set.images.names)

@@ -27,7 +27,7 @@ def correct_rolling_shutter(
 
     Args:
         video: tracks of all frames; neighbouring observations give their velocities.
-        shown: how the pictures are shown whose pixels the tracks are in.
+        shown: how images show the video; tracks are in pixels of the images.
         frame_rate: frames per second; None if unknown.
         camera: the read-out time, the model and given intrinsics.
         context: its clock gets the stage "shutter".
