@@ -595,6 +595,27 @@ def test_mapper_refines_a_default_focal_length_if_it_begins_well_so(
 
 
 @pytest.mark.shared
+def test_mapper_keeps_estimated_intrinsics_that_two_images_hardly_determine(
+    shared: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """If the mapper refined them, COLMAP 4.2 would write a first model of three images."""
+    clip = shared / "sequences" / "holiday_display" / "clip.mp4"
+    small = ffmpeg("-i", clip, "-vf", "scale=224:400", "-crf", "20", tmp_path / "small.mp4")
+    report = match(tmp_path / "a.db", small, image_path=tmp_path / "frames")
+    assert report.fixed_intrinsics
+    assert report.focal_length is not None
+    output = tmp_path / "models"
+    output.mkdir()
+    options = pycolmap.IncrementalPipelineOptions(num_threads=1)
+    options.mapper.init_min_tri_angle = report.map_options.init_min_tri_angle or 16.0
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    models = pycolmap.incremental_mapping(
+        tmp_path / "a.db", tmp_path / "frames", output, options=options
+    )
+    assert [model.num_reg_images() for model in models.values()] == [report.num_images]
+
+
+@pytest.mark.shared
 def test_drive_with_unknown_intrinsics_is_mapped(street: Street, tmp_path: Path) -> None:
     report = match(tmp_path / "a.db", street(20), image_path=tmp_path / "frames")
     assert report.estimate is not None

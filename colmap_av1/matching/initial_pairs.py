@@ -50,6 +50,9 @@ _WIDE_SHARE = 0.75
 # this many pairs.
 _LARGE = 0.8
 _NUM_GROWN = 16
+# The mapper should keep the intrinsics if they diverge with this share of the initial pairs. On
+# eight clips it was 0 or at least a third: the angle of view is narrow, or the parallax small.
+_DIVERGING_SHARE = 0.1
 # With several threads, the mapper tries the pairs of up to 16 images at a time. Before it begins
 # with the n-th pair of one image, counted from 0, it may find one of the first 2 n + 2 of another.
 _NUM_THREADS = 16
@@ -67,12 +70,15 @@ class PreparedStart:
         limits: the limits of the initial pair that the mapper needs.
         is_certain: a pair certainly meets these limits. If not, the mapper may have to lower them.
         is_tried: the mapper begins well with the pair that it finds first, as trials have shown.
+        intrinsics_diverge: two images hardly determine the intrinsics. A pair with which the mapper
+            begins well in a trial may still diverge, so it should not refine them.
     """
 
     matched: MatchedImages
     limits: InitialLimits
     is_certain: bool
     is_tried: bool
+    intrinsics_diverge: bool
 
 
 def prepare_start(
@@ -157,7 +163,13 @@ def prepare_start(
                 demote = own.bad_pairs_of_limits([limits, *limits.relaxed], demote, most)
             # With several models, the mapper may begin with another one than expected.
             is_tried = len(known) == 1 and not search.has_untried_pair
-    return PreparedStart(with_demoted(matched, demote, most), limits, is_certain, is_tried)
+    return PreparedStart(
+        matched=with_demoted(matched, demote, most),
+        limits=limits,
+        is_certain=is_certain,
+        is_tried=is_tried,
+        intrinsics_diverge=search is not None and search.intrinsics_diverge,
+    )
 
 
 def with_demoted(
@@ -270,6 +282,7 @@ class _Search:
 
     Attributes:
         has_untried_pair: whether a pair was not tried because its images have different cameras.
+        intrinsics_diverge: see `PreparedStart`.
     """
 
     def __init__(
@@ -282,12 +295,18 @@ class _Search:
         self._matched, self._cameras, self._found = matched, cameras, found
         self._growth = growth
         self.has_untried_pair = False
+        self._num_begun = self._num_diverged = 0
         self._known_large = dict[int, bool]()
         self._known_begun = dict[tuple[int, InitialLimits], bool | None]()
         some = np.flatnonzero(found.certain(FORWARD_MOTION))
         some = some[evenly_spread(len(some), _NUM_GROWN)]
         grown = [int(growth.registered(matched.pairs[k].tolist()).sum()) for k in some]
         self._large_size = math.ceil(_LARGE * max(grown, default=0))
+
+    @property
+    def intrinsics_diverge(self) -> bool:
+        """See `PreparedStart`; decided by the pairs tried so far."""
+        return self._num_diverged > _DIVERGING_SHARE * self._num_begun
 
     def of_model(self, number: int) -> _Search:
         """The search among the images of one model, after the others are registered."""
@@ -431,7 +450,9 @@ class _Search:
         begun = try_initial_pair(xy, camera, limits, refine_intrinsics=limits != FORWARD_MOTION)
         if begun is None:
             return None
+        self._num_begun += 1
         if begun.diverged:
+            self._num_diverged += 1
             return False
         angle = max(limits.init_min_tri_angle, float(self._found.angle[k]))
         return not is_wrong_rotation(begun.cam2_from_cam1[:, :3], pose[:, :3], angle)

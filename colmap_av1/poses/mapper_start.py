@@ -59,7 +59,9 @@ def choose_mapper_start(
     # The poses of pairs are wrong if a focal length is assumed.
     start = prepare_start(found.matched, found.cameras, clock, [] if is_assumed else poses)
     cameras, known_cameras = found.cameras, with_known_focal_lengths(found.cameras)
+    are_known = all(camera.has_prior_focal_length for camera in found.cameras)
     fixed_intrinsics = start.limits == FORWARD_MOTION and not is_assumed
+    fixed_intrinsics |= start.intrinsics_diverge and are_known and not keep_cameras
     warnings = []
     if is_assumed and poses and not keep_cameras:
         with suppress(ModelError):

@@ -89,7 +89,9 @@ def num_registered(matched: MatchedImages, folder: Path) -> list[int]:
 
 
 def prepared(matched: MatchedImages) -> PreparedStart:
-    return PreparedStart(matched, DEFAULT_LIMITS, is_certain=True, is_tried=False)
+    return PreparedStart(
+        matched, DEFAULT_LIMITS, is_certain=True, is_tried=False, intrinsics_diverge=False
+    )
 
 
 def test_pair_from_which_no_model_grows_is_demoted(
