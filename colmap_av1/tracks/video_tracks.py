@@ -314,8 +314,8 @@ def _notes(source: VideoSource, overlay_share: float, reasons: Sequence[str]) ->
     notes = []
     if overlay_share >= _NOTABLE_SHARE:
         notes.append(
-            f"removed {overlay_share:.0%} of the tracks as overlays, which stand still while the "
-            "picture moves, such as logos and dashboards"
+            f"removed {overlay_share:.0%} of the tracks, which stand still while the picture "
+            "moves: overlays such as logos and dashboards, or plain areas of a noisy video"
         )
     if reasons and source.stream is source.pictures:
         notes.append(f"{'; '.join(reasons)}; or use --reencode 1 to convert the video first")
