@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from colmap_av1.matching.features.sift import extract_features, match_features
+from colmap_av1.matching.features.sift import Features, extract_features, match_features
 
 
 @pytest.mark.parametrize("effort", ["light", "full"])
@@ -26,6 +26,13 @@ def test_features_of_large_pictures_are_located_accurately(
     off = whole.xy[matches[:, 0]] - (part.xy[matches[:, 1]] + [400, 200])
     assert np.median(np.abs(off)) < 0.2
     assert np.abs(np.median(off, axis=0)).max() < 0.1
+
+
+def test_equal_descriptors_have_one_match() -> None:
+    descriptors = np.eye(4, 128, dtype=np.float32)
+    a = Features(np.zeros((5, 2), np.float32), descriptors[[0, 1, 1, 2, 3]])
+    b = Features(np.zeros((4, 2), np.float32), descriptors)
+    assert match_features(a, b).tolist() == [[0, 0], [1, 1], [3, 2], [4, 3]]
 
 
 def test_untextured_pictures_have_no_features() -> None:

@@ -99,9 +99,12 @@ def match_features(a: Features, b: Features) -> NDArray[np.uint32]:
     rows = np.arange(len(similarity))
     nearest = similarity.argmax(axis=1)
     best = similarity[rows, nearest]
-    is_mutual = best == similarity.max(axis=0)[nearest]  # `argmax` is slow along columns
+    # `argmax` along columns would be slow.
+    is_mutual = best == similarity.max(axis=0)[nearest]
     similarity[rows, nearest] = -1
     second = similarity.max(axis=1)
     angle, second_angle = (np.arccos(np.clip(x, -1, 1)) for x in (best, second))
-    kept = is_mutual & (angle <= _MAX_ANGLE) & (angle <= _MAX_RATIO * second_angle)
-    return np.column_stack([rows[kept], nearest[kept]]).astype(np.uint32)
+    kept = rows[is_mutual & (angle <= _MAX_ANGLE) & (angle <= _MAX_RATIO * second_angle)]
+    # Of equal descriptors, the first is matched.
+    kept = kept[np.sort(np.unique(nearest[kept], return_index=True)[1])]
+    return np.column_stack([kept, nearest[kept]]).astype(np.uint32)
