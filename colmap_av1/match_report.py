@@ -60,8 +60,8 @@ class MatchReport:
             triangulation angle to begin with a pair from which a large model grows.
         fixed_intrinsics: the mapper should not refine focal length and distortion, because they
             are known and would diverge with its first images, as where the camera moves along its
-            axis, or because the images do not determine them, and no large model grows in a trial
-            if they are refined.
+            axis (those of an existing database only in this case), or because the images do not
+            determine them, and no large model grows in a trial if they are refined.
         links: SIFT links between images that motion does not connect.
         estimate: summary of the joint estimate of all poses that matches were verified against;
             None if they were verified pair by pair.

@@ -69,7 +69,7 @@ def match_rows(report: MatchReport) -> Rows:
     elif report.small_angles:
         rows.append(("triangulation angles", "small: the mapper starts well with the option below"))
     if report.fixed_intrinsics and not report.forward_motion:
-        rows.append(("intrinsics", "few images hardly determine them: the options below fix them"))
+        rows.append(("intrinsics", "not determined by a few images: the options below keep them"))
     return [*rows, *_seconds_rows(report.seconds)]
 
 

@@ -50,9 +50,10 @@ _WIDE_SHARE = 0.75
 # this many pairs.
 _LARGE = 0.8
 _NUM_GROWN = 16
-# The mapper should keep the intrinsics if they diverge with this share of the initial pairs. On
-# eight clips it was 0 or at least a third: the angle of view is narrow, or the parallax small.
-_DIVERGING_SHARE = 0.1
+# The mapper should keep the intrinsics if they diverge with at least this number of pairs, and with
+# more than this share of those with which it begins in a trial. On eight clips the share was 0, or
+# at least a third where the angle of view is narrow or the parallax small.
+_NUM_DIVERGING, _DIVERGING_SHARE = 3, 0.1
 # With several threads, the mapper tries the pairs of up to 16 images at a time. Before it begins
 # with the n-th pair of one image, counted from 0, it may find one of the first 2 n + 2 of another.
 _NUM_THREADS = 16
@@ -69,9 +70,10 @@ class PreparedStart:
         matched: the images. Pairs that would be a bad initial pair have fewer inliers.
         limits: the limits of the initial pair that the mapper needs.
         is_certain: a pair certainly meets these limits. If not, the mapper may have to lower them.
-        is_tried: the mapper begins well with the pair that it finds first, as trials have shown.
-        intrinsics_diverge: two images hardly determine the intrinsics. A pair with which the mapper
-            begins well in a trial may still diverge, so it should not refine them.
+        is_tried: the mapper begins well with the pair that it finds first, as trials have shown. It
+            refined the intrinsics, except with `FORWARD_MOTION`.
+        intrinsics_diverge: the intrinsics diverge with many of the tried pairs. They may then
+            diverge even with a pair that begins well in a trial, so the mapper should keep them.
     """
 
     matched: MatchedImages
@@ -295,7 +297,7 @@ class _Search:
         self._matched, self._cameras, self._found = matched, cameras, found
         self._growth = growth
         self.has_untried_pair = False
-        self._num_begun = self._num_diverged = 0
+        self._diverged, self._begun = set[int](), set[int]()  # pairs
         self._known_large = dict[int, bool]()
         self._known_begun = dict[tuple[int, InitialLimits], bool | None]()
         some = np.flatnonzero(found.certain(FORWARD_MOTION))
@@ -305,8 +307,9 @@ class _Search:
 
     @property
     def intrinsics_diverge(self) -> bool:
-        """See `PreparedStart`; decided by the pairs tried so far."""
-        return self._num_diverged > _DIVERGING_SHARE * self._num_begun
+        """See `PreparedStart`; decided by the pairs of all models tried so far."""
+        count = len(self._diverged)
+        return count >= _NUM_DIVERGING and count > _DIVERGING_SHARE * len(self._begun)
 
     def of_model(self, number: int) -> _Search:
         """The search among the images of one model, after the others are registered."""
@@ -314,6 +317,7 @@ class _Search:
         found = replace(self._found, count=np.where(is_own.all(axis=1), self._found.count, 0))
         own = _Search(self._matched, self._cameras, found, self._growth)
         own._known_begun = self._known_begun
+        own._diverged, own._begun = self._diverged, self._begun
         return own
 
     def first_certain(self) -> tuple[InitialLimits | None, set[int]]:
@@ -450,9 +454,9 @@ class _Search:
         begun = try_initial_pair(xy, camera, limits, refine_intrinsics=limits != FORWARD_MOTION)
         if begun is None:
             return None
-        self._num_begun += 1
+        self._begun.add(k)
         if begun.diverged:
-            self._num_diverged += 1
+            self._diverged.add(k)
             return False
         angle = max(limits.init_min_tri_angle, float(self._found.angle[k]))
         return not is_wrong_rotation(begun.cam2_from_cam1[:, :3], pose[:, :3], angle)

@@ -59,9 +59,9 @@ def choose_mapper_start(
     # The poses of pairs are wrong if a focal length is assumed.
     start = prepare_start(found.matched, found.cameras, clock, [] if is_assumed else poses)
     cameras, known_cameras = found.cameras, with_known_focal_lengths(found.cameras)
-    are_known = all(camera.has_prior_focal_length for camera in found.cameras)
-    fixed_intrinsics = start.limits == FORWARD_MOTION and not is_assumed
-    fixed_intrinsics |= start.intrinsics_diverge and are_known and not keep_cameras
+    # Cameras of an existing database are often rough, as from EXIF data.
+    would_diverge = start.intrinsics_diverge and not keep_cameras
+    fixed_intrinsics = not is_assumed and (start.limits == FORWARD_MOTION or would_diverge)
     warnings = []
     if is_assumed and poses and not keep_cameras:
         with suppress(ModelError):
@@ -76,7 +76,7 @@ def choose_mapper_start(
         cameras, fixed_intrinsics = known_cameras, True
     matched = None
     # Without depth, there is no good start.
-    if found.depth.is_observable and not start.is_tried:
+    if found.depth.is_observable and (would_diverge or not start.is_tried):
         try:
             matched = demote_failing_starts(
                 start, names, known_cameras, clock, fixed_intrinsics=fixed_intrinsics

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
 
 from colmap_av1.geometry.cameras import make_camera
-from colmap_av1.matching.initial_pairs import prepare_start
+from colmap_av1.matching.initial_pairs import PreparedStart, prepare_start
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
@@ -219,12 +219,12 @@ def test_pair_with_few_inliers_is_demoted_if_no_pair_has_a_large_angle() -> None
     assert kept == [given[0], INITIAL_MIN_INLIERS // 4 - 1, given[2]]
 
 
-def num_inliers(
+def prepared(
     views: list[tuple[list[ImageKeypoints], NDArray[np.uint32]]],
     poses: list[NDArray[np.float64] | None],
     models: list[int] | None = None,
-) -> list[int]:
-    """Number of inliers that each pair of images keeps, given the poses of their second images.
+) -> PreparedStart:
+    """Prepare pairs of images, given the poses of their second images.
 
     The images of a pair are no neighbours. With None, the pose of both images is unknown. `models`
     gives the model of each pair; without it, all are in one.
@@ -246,8 +246,17 @@ def num_inliers(
     matched = MatchedImages(
         keypoints, pairs, [g.inlier_matches for g in geometries], geometries, False
     )
-    found = prepare_start(matched, [CAMERA] * len(keypoints), Clock(), known)
-    return [len(geometry.inlier_matches) for geometry in found.matched.geometries]
+    return prepare_start(matched, [CAMERA] * len(keypoints), Clock(), known)
+
+
+def num_inliers(
+    views: list[tuple[list[ImageKeypoints], NDArray[np.uint32]]],
+    poses: list[NDArray[np.float64] | None],
+    models: list[int] | None = None,
+) -> list[int]:
+    """Number of inliers that each of these pairs keeps."""
+    matched = prepared(views, poses, models).matched
+    return [len(geometry.inlier_matches) for geometry in matched.geometries]
 
 
 def towards_a_wall(rng: np.random.Generator) -> tuple[list[ImageKeypoints], NDArray[np.uint32]]:
@@ -277,6 +286,16 @@ def test_pair_whose_intrinsics_diverge_is_demoted() -> None:
     rng = np.random.default_rng(3)
     views = [turned_views(*shape, rng) for shape in ((0.5, 0.3, 300), (0.1, 0.02, 600))]
     assert num_inliers(views, [TURNED, TURNED]) == [300, INITIAL_MIN_INLIERS // 2 - 1]
+
+
+@pytest.mark.parametrize(("num_diverging", "diverge"), [(0, False), (1, False), (12, True)])
+def test_intrinsics_that_diverge_with_many_pairs_are_to_be_kept(
+    num_diverging: int, diverge: bool
+) -> None:
+    rng = np.random.default_rng(3)
+    shapes = [(0.5, 0.3, 300), *[(0.1, 0.02, 600)] * num_diverging]
+    views = [turned_views(*shape, rng) for shape in shapes]
+    assert prepared(views, [TURNED] * len(views)).intrinsics_diverge == diverge
 
 
 def test_pair_whose_intrinsics_diverge_is_demoted_in_a_further_model() -> None:
