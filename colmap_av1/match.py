@@ -106,12 +106,13 @@ def match(
         check_copies(inputs.photos, folder)
     context = RunContext.of(options.run, progress)
     clock = context.clock
-    num_written, blurred = 0, list[str]()
+    num_written = 0
+    blurred = list[str]()
     with unchanged(*inputs.states) as check_videos, ExitStack() as opened:
         scratch = None
         if wants_joint_estimate(options, writes_images=folder is not None):
             scratch = opened.enter_context(scratch_folder(database))
-        images = _prepare(
+        prepared = _prepare(
             inputs,
             listed_of_videos(database, listed, inputs),
             folder,
@@ -120,9 +121,9 @@ def match(
             scratch=scratch,
             context=context,
         )
-        image_set, videos = images.image_set, images.videos
-        cameras = listed_image_cameras(database, listed, images) if listed else None
-        found = match_prepared(images, cameras, scratch, options, context)
+        image_set, videos = prepared.image_set, prepared.videos
+        cameras = listed_image_cameras(database, listed, prepared) if listed else None
+        found = match_prepared(prepared, cameras, scratch, options, context)
         names = image_set.images.names
         start = choose_mapper_start(found, names, clock, keep_cameras=cameras is not None)
         written = start.matched
@@ -130,7 +131,7 @@ def match(
             check_videos()
             with clock.measure("images"), alone_in(folder):
                 num_written, blurred = write_all_prepared(
-                    images, folder, options.reading, context, before=before
+                    prepared, folder, options.reading, context, before=before
                 )
     with clock.measure("database"):
         positions = image_positions(image_set, inputs.videos, inputs.photos)

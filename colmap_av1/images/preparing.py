@@ -184,11 +184,11 @@ def prepare_images(
         if not existing and kept:
             # Another program may have numbered other frames than the pattern does.
             some = [kept[0], kept[min(_CHECKED, len(kept) - 1)]]
-            _check_content(prepared, dict(some), options.reading, context)
+            _check_files(prepared, dict(some), options.reading, context)
     return prepared
 
 
-def _check_content(
+def _check_files(
     prepared: PreparedImages, frame_of: Mapping[Path, int], read: ReadOptions, context: RunContext
 ) -> None:
     """Check that image files show their frames of the video, given in ascending order.
@@ -268,9 +268,10 @@ def write_all_prepared(
         for name, frame in zip(chosen.names, chosen.frames.tolist(), strict=True):
             path = own_folder / name
             if path not in before and path.exists():
-                _check_content(own, {path: frame}, read, context)
+                _check_files(own, {path: frame}, read, context)
                 break
-    num_written, warnings = copy_photos(prepared.inputs.photos, folder), list[str]()
+    num_written = copy_photos(prepared.inputs.photos, folder)
+    warnings = list[str]()
     for own, own_folder in of_videos:
         num_written += write_prepared(own, own_folder, read, context.progress)
         warning = blur_warning([own_folder / name for name in own.tracked.chosen.names])

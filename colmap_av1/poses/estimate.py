@@ -40,7 +40,7 @@ class _Plan:
 
     Attributes:
         doubted: frames after doubtful seams, where links replace motion.
-        links: sift: look for loop closures in all videos; none: use no links; None: as in the
+        links: "sift": look for loop closures in all videos; "none": use no links; None: as in the
             options of the run.
         first: file of the mapper's model to continue with; None for the largest.
     """
@@ -168,9 +168,9 @@ def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet)
 
     first = decided("first_estimate", [], _FirstEstimate, lambda: _first_estimate(estimates))
     further = decided("further_links", [first], _Plan, lambda: _further_links(estimates, first))
-    links = decided("links", [further], _Plan, lambda: _used_links(estimates, further))
-    model = decided("first_model", [links], _Plan, lambda: _first_model(estimates, links))
-    return estimates.split(model)
+    used = decided("links", [further], _Plan, lambda: _used_links(estimates, further))
+    plan = decided("first_model", [used], _Plan, lambda: _first_model(estimates, used))
+    return estimates.split(plan)
 
 
 def _first_estimate(estimates: _Estimates) -> _FirstEstimate:

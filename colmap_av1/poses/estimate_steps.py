@@ -315,7 +315,8 @@ class SplitModel:
 
     Attributes:
         estimate: the poses of its largest part.
-        uncertain: result of `certain_stage` if too few images of this part are certain; else None.
+        uncertain: result of `certain_stage` if too few images of this part are certain: `estimate`
+            then has all of them, and a further model is not used. Else None.
     """
 
     estimate: Estimate

@@ -75,7 +75,7 @@ class StartSettings(MapperSettings):
 
 
 class AdjustmentSettings(TypedDict):
-    """Settings of a bundle adjustment, see `adjust_model`."""
+    """Settings of a bundle adjustment, see the arguments of `adjust_model`."""
 
     task: Literal["adjustment"]
     model: str
@@ -123,15 +123,7 @@ def run_child(settings: Settings) -> None:
 
 
 def run_mapping(settings: MappingSettings, on_image: Callable[[], None] | None = None) -> list[int]:
-    """Map a database, see `run_mapper`.
-
-    Args:
-        settings: the settings.
-        on_image: called whenever the incremental mapper registers an image.
-
-    Returns:
-        Number of registered images of each model.
-    """
+    """Map a database, see `run_mapper`; `on_image` is called whenever an image is registered."""
     import numpy as np  # noqa: F401, PLC0415 - before pycolmap
     import pycolmap  # noqa: PLC0415 - after the redirection in run_child
 
