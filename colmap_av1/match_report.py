@@ -30,7 +30,7 @@ class MatchReport:
         videos: the video files.
         streams: for each video, the AV1 file whose motion was read: the video or its conversion;
             None if the conversion was not kept.
-        conversion: how videos were converted, in words; None if all are AV1.
+        conversion: description of how videos were converted; None if all are AV1.
         photos: folder of the photos; None if none was given.
         image_path: folder of the images; None if none was given.
         densify_options: options with which `densify` reads the same videos, masks and images.

@@ -11,7 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_av1.matching.growth import Growth
-from colmap_av1.matching.initial_pair_trial import try_initial_pair
+from colmap_av1.matching.initial_pair_trial import InitialPairTrial, try_initial_pair
 from colmap_av1.matching.mapper_limits import (
     DEFAULT_LIMITS,
     FORWARD_MOTION,
@@ -297,9 +297,8 @@ class _Search:
         self._matched, self._cameras, self._found = matched, cameras, found
         self._growth = growth
         self.has_untried_pair = False
-        self._diverged, self._begun = set[int](), set[int]()  # pairs
         self._known_large = dict[int, bool]()
-        self._known_begun = dict[tuple[int, InitialLimits], bool | None]()
+        self._trials = dict[tuple[int, InitialLimits], InitialPairTrial | None]()
         some = np.flatnonzero(found.certain(FORWARD_MOTION))
         some = some[evenly_spread(len(some), _NUM_GROWN)]
         grown = [int(growth.registered(matched.pairs[k].tolist()).sum()) for k in some]
@@ -308,16 +307,17 @@ class _Search:
     @property
     def intrinsics_diverge(self) -> bool:
         """See `PreparedStart`; decided by the pairs of all models tried so far."""
-        count = len(self._diverged)
-        return count >= _NUM_DIVERGING and count > _DIVERGING_SHARE * len(self._begun)
+        begun = [(k, trial) for (k, _), trial in self._trials.items() if trial is not None]
+        num_diverged = len({k for k, trial in begun if trial.diverged})
+        num_begun = len({k for k, _ in begun})
+        return num_diverged >= _NUM_DIVERGING and num_diverged > _DIVERGING_SHARE * num_begun
 
     def of_model(self, number: int) -> _Search:
         """The search among the images of one model, after the others are registered."""
         is_own = self._growth.model_of[self._matched.pairs] == number
         found = replace(self._found, count=np.where(is_own.all(axis=1), self._found.count, 0))
         own = _Search(self._matched, self._cameras, found, self._growth)
-        own._known_begun = self._known_begun
-        own._diverged, own._begun = self._diverged, self._begun
+        own._trials = self._trials
         return own
 
     def first_certain(self) -> tuple[InitialLimits | None, set[int]]:
@@ -434,32 +434,33 @@ class _Search:
 
     def _begins(self, k: int, limits: InitialLimits) -> bool | None:
         """Whether the mapper begins well with a pair; None if it does not begin with it."""
-        if (k, limits) not in self._known_begun:
-            self._known_begun[k, limits] = self._begins_in_trial(k, limits)
-        return self._known_begun[k, limits]
-
-    def _begins_in_trial(self, k: int, limits: InitialLimits) -> bool | None:
-        first, second = pair = self._matched.pairs[k].tolist()
-        camera, pose = self._cameras[first], self._found.known_pose[k]
-        assert pose is not None
+        first, second = self._matched.pairs[k].tolist()
         # With a zoom, each image has its own camera. The mapper's first adjustment diverges then,
         # and most models grow nevertheless.
-        if camera is not self._cameras[second]:
+        if self._cameras[first] is not self._cameras[second]:
             self.has_untried_pair = True
             return True
+        if (k, limits) not in self._trials:
+            self._trials[k, limits] = self._trial(k, limits)
+        begun = self._trials[k, limits]
+        if begun is None:
+            return None
+        if begun.diverged:
+            return False
+        pose = self._found.known_pose[k]
+        assert pose is not None
+        angle = max(limits.init_min_tri_angle, float(self._found.angle[k]))
+        return not is_wrong_rotation(begun.cam2_from_cam1[:, :3], pose[:, :3], angle)
+
+    def _trial(self, k: int, limits: InitialLimits) -> InitialPairTrial | None:
+        """The mapper's model of a pair; None if it does not begin with it."""
+        pair = self._matched.pairs[k].tolist()
         inliers = self._matched.geometries[k].inlier_matches.T
         xy = [
             self._matched.keypoints[image].xy[own] for image, own in zip(pair, inliers, strict=True)
         ]
-        begun = try_initial_pair(xy, camera, limits, refine_intrinsics=limits != FORWARD_MOTION)
-        if begun is None:
-            return None
-        self._begun.add(k)
-        if begun.diverged:
-            self._diverged.add(k)
-            return False
-        angle = max(limits.init_min_tri_angle, float(self._found.angle[k]))
-        return not is_wrong_rotation(begun.cam2_from_cam1[:, :3], pose[:, :3], angle)
+        refine = limits != FORWARD_MOTION
+        return try_initial_pair(xy, self._cameras[pair[0]], limits, refine_intrinsics=refine)
 
 
 def are_far(pairs: NDArray[np.int32]) -> Bools:

@@ -105,6 +105,6 @@ def match_features(a: Features, b: Features) -> NDArray[np.uint32]:
     second = similarity.max(axis=1)
     angle, second_angle = (np.arccos(np.clip(x, -1, 1)) for x in (best, second))
     kept = rows[is_mutual & (angle <= _MAX_ANGLE) & (angle <= _MAX_RATIO * second_angle)]
-    # Of equal descriptors, the first is matched.
+    # If descriptors are equal, only the first one is matched.
     kept = kept[np.sort(np.unique(nearest[kept], return_index=True)[1])]
     return np.column_stack([kept, nearest[kept]]).astype(np.uint32)
