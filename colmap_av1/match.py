@@ -36,7 +36,6 @@ from colmap_av1.options import CameraOptions, MatchOptions
 from colmap_av1.poses.joint_matches import JointMatches
 from colmap_av1.poses.mapper_start import choose_mapper_start
 from colmap_av1.poses.match_prepared import match_prepared, wants_joint_estimate
-from colmap_av1.poses.track_stage import encoding_for_pictures
 from colmap_av1.util.cpus import one_blas_thread
 from colmap_av1.util.files import check_outside, scratch_folder
 from colmap_av1.util.progress import Progress, no_progress
@@ -215,7 +214,7 @@ def _prepare(
         context: state of the run.
     """
     if scratch is not None:
-        options = replace(options, encode=encoding_for_pictures(options.encode))
+        options = replace(options, encode=options.encode.quick_by_default)
     videos = []
     for number, (video, label, masks, existing) in enumerate(
         zip(inputs.videos, inputs.labels, inputs.masks_of_videos, listed, strict=True)

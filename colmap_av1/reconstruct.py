@@ -28,12 +28,7 @@ from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.placing.placement import Place
 from colmap_av1.poses.posed_images import read_poses
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_stage import (
-    encoding_for_pictures,
-    read_tracks,
-    stage_of_video,
-    track_stage,
-)
+from colmap_av1.poses.track_stage import read_tracks, stage_of_video, track_stage
 from colmap_av1.splats.gaussians import check_gaussians_path, write_model_gaussians
 from colmap_av1.splats.reconstruct_model import ModelResult
 from colmap_av1.splats.reconstruct_models import FurtherModel, further_models, written_model
@@ -299,7 +294,7 @@ def _as_converted(options: ReconstructOptions) -> MatchOptions:
     """The options for the conversion of videos."""
     if not options.poses.adjust:
         return options.match
-    return replace(options.match, encode=encoding_for_pictures(options.match.encode))
+    return replace(options.match, encode=options.match.encode.quick_by_default)
 
 
 def _run_stages(run: Run) -> ReconstructReport:

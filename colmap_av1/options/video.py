@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 from colmap_av1.options.fields import Options, option
@@ -91,3 +91,8 @@ class EncodeOptions(Options):
         least=1,
         most=16,
     )
+
+    @property
+    def quick_by_default(self) -> EncodeOptions:
+        """A copy for poses that are refined on the pictures: effort "auto" becomes "quick"."""
+        return replace(self, effort="quick") if self.effort == "auto" else self

@@ -22,7 +22,7 @@ from colmap_av1.images.track_images import (
     track_images,
 )
 from colmap_av1.matching.shutter.correct import correct_rolling_shutter, shutter_settings
-from colmap_av1.options import EncodeOptions, RefineOptions, TrackingOptions
+from colmap_av1.options import RefineOptions, TrackingOptions
 from colmap_av1.poses.key_images import key_images_of_video
 from colmap_av1.poses.mapper import LEAST_IMAGES
 from colmap_av1.poses.run import Run
@@ -91,11 +91,6 @@ class TracksResult:
     num_tracks: int
     read_out: float | None
     warnings: tuple[str, ...]
-
-
-def encoding_for_pictures(encode: EncodeOptions) -> EncodeOptions:
-    """Encoding options if corners refine the poses later: quick by default."""
-    return replace(encode, effort="quick") if encode.effort == "auto" else encode
 
 
 def stage_of_video(run: Run, video: int) -> str:
