@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_av1.geometry.cameras import has_long_focal_length
-from colmap_av1.geometry.masks import Mask
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import write_posed_model
 from colmap_av1.images.image_set import ImageSet
@@ -22,6 +20,7 @@ from colmap_av1.poses.adjusting import (
 )
 from colmap_av1.poses.corners.in_images import corners_in_images
 from colmap_av1.poses.dynamic.following import follow_occluded, has_changing_masks
+from colmap_av1.poses.estimate_tracks import EstimateTracks
 from colmap_av1.poses.posed_images import (
     FOR_POSES,
     FROM_PICTURES,
@@ -86,14 +85,10 @@ class AdjustedResult(PosesResult):
 
 def adjustment_stage(
     run: Run,
-    tracks: Tracks,
-    links: Tracks,
+    tracks: EstimateTracks,
     image_set: ImageSet,
     poses: Kept[PosesResult],
     *,
-    dynamic_masks: Mapping[str, Mask],
-    masks_digest: str | None,
-    has_picture_positions: bool,
     is_fast: bool = False,
     is_assumed: bool = False,
     number: int = 1,
@@ -106,15 +101,9 @@ def adjustment_stage(
 
     Args:
         run: the run.
-        tracks: the tracks of all sequences.
-        links: links as tracks.
+        tracks: the tracks of all videos, without dynamic pixels.
         image_set: the images.
         poses: the stage with the initial poses.
-        dynamic_masks: masks that exclude dynamic pixels, by image name; `tracks` and `links` have
-            none of these pixels.
-        masks_digest: digest of the stage that found them; None if there are none.
-        has_picture_positions: whether tracks have positions in the pictures; else the pictures are
-            not used.
         is_fast: the camera turns fast somewhere, so that the scale may be poorly determined.
         is_assumed: the adjustment starts from a default focal length, so it needs more steps.
         number: number of the adjustment in the run, which names its files.
@@ -122,18 +111,20 @@ def adjustment_stage(
     options = run.options
     suffix = f"_{number}" if number > 1 else ""
     refine = refines_intrinsics(options)
-    has_gaps = bool(dynamic_masks) or has_changing_masks(image_set)
+    has_gaps = bool(tracks.dynamic_masks) or has_changing_masks(image_set)
 
     def make(partial: Path) -> AdjustedResult:
-        registered = read_posed_images(run, poses, image_set.masked_by(dynamic_masks))
+        registered = read_posed_images(run, poses, image_set.masked_by(tracks.dynamic_masks))
         # Not kept in a variable: the long tracks need several times the memory of the selection.
-        spread = select_tracks(run.pose_tracks(tracks).keep_frames(registered.frames), _ADJUSTED)
-        if has_picture_positions and has_gaps:
+        spread = select_tracks(
+            run.pose_tracks(tracks.motion).keep_frames(registered.frames), _ADJUSTED
+        )
+        if tracks.has_picture_positions and has_gaps:
             with run.clock.measure("refinement"):
                 spread = follow_occluded(run, spread, registered)
-        linked = links.keep_frames(registered.frames)
+        linked = tracks.links.keep_frames(registered.frames)
         sets = [(spread, FOR_POSES), (linked, FOR_POSES)]
-        if has_picture_positions:
+        if tracks.has_picture_positions:
             with run.clock.measure("refinement"):
                 guide = Tracks.concatenate(spread, linked)
                 followed, registered = corners_in_images(run, guide, registered)
@@ -182,8 +173,8 @@ def adjustment_stage(
             poses.digest,
             given,
             options.match.camera.single_camera,
-            has_picture_positions,
-            masks_digest,
+            tracks.has_picture_positions,
+            tracks.masks_digest,
         ],
         AdjustedResult,
         products=[f"adjusted{suffix}.npz"],

@@ -210,7 +210,7 @@ def _used_links(estimates: _Estimates, plan: _Plan) -> _Plan:
     may_mislead = (
         estimates.run.options.match.links.links == "auto"
         and estimates.image_set.num_sequences == 1
-        and estimates.split(plan).link_tracks.num_tracks > 0
+        and estimates.split(plan).tracks.links.num_tracks > 0
     )
     if not (may_mislead and linked.is_contradicted):
         return plan

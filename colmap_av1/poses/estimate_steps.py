@@ -8,20 +8,14 @@ adjusted observations, and split at seams that hardly any points connect.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import count
 
 from colmap_av1.errors import ModelError
-from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.adjustment_stage import AdjustedResult, adjustment_stage
-from colmap_av1.poses.dynamic.stage import (
-    DynamicResult,
-    dynamic_stage,
-    read_dynamic_masks,
-    without_dynamic_links,
-    without_dynamic_tracks,
-)
+from colmap_av1.poses.dynamic.stage import DynamicResult, dynamic_stage, without_dynamic
+from colmap_av1.poses.estimate_tracks import EstimateTracks
 from colmap_av1.poses.false_links import leaping_seams
 from colmap_av1.poses.long_range_stage import LongRangeResult, long_range_stage
 from colmap_av1.poses.mapping_stage import MappedResult, mapping_stage, with_model_first
@@ -51,14 +45,9 @@ class Estimate:
         matches: the database of the key images, see `match_stage`; that of the first model.
         mapped: the poses of the key images, see `mapping_stage`; after a second mapping or a split,
             those of all its images.
-        tracks: the tracks of all videos, cut at gaps that links replace and at seams of splits,
-            without dynamic pixels.
-        link_tracks: links as tracks, without dynamic pixels.
-        has_picture_positions: whether tracks have positions in the pictures; false if they were
-            corrected for a rolling shutter.
+        tracks: the tracks of all videos.
         resection: the poses of the images in between; None if all images are key images.
         dynamic: the dynamic objects; None if they were not looked for.
-        dynamic_masks: masks that exclude dynamic objects, by image name.
         adjustment: the adjusted poses; None if they are not adjusted.
         long_range: the long-range check; None if it was not made.
         rival: the adjustment of the first mapping if a second one replaced it, but fits the
@@ -67,12 +56,9 @@ class Estimate:
 
     matches: Kept[MatchesResult]
     mapped: Kept[MappedResult]
-    tracks: Tracks
-    link_tracks: Tracks
-    has_picture_positions: bool
+    tracks: EstimateTracks
     resection: Kept[PosesResult] | None = None
     dynamic: Kept[DynamicResult] | None = None
-    dynamic_masks: dict[str, Mask] = field(default_factory=dict)
     adjustment: Kept[AdjustedResult] | None = None
     long_range: Kept[LongRangeResult] | None = None
     rival: Kept[AdjustedResult] | None = None
@@ -81,11 +67,6 @@ class Estimate:
     def last(self) -> Kept[PosesResult]:
         """The stage with the final poses."""
         return self.adjustment or self.resection or self.mapped
-
-    @property
-    def masks_digest(self) -> str | None:
-        """Digest of the stage that found dynamic objects; None if there are none."""
-        return self.dynamic.digest if self.dynamic is not None and self.dynamic_masks else None
 
     @property
     def is_contradicted(self) -> bool:
@@ -199,12 +180,12 @@ def mapped_poses(
         mapped: the poses of the mapper.
         tracks: the tracks of each video.
         image_set: all images.
-        has_picture_positions: see `Estimate`.
+        has_picture_positions: see `EstimateTracks`.
     """
     links, contradicted = read_links(run.stages)
     every = Tracks.in_sequence(tracks, image_set.num_frames)
     cut = every.split_after_frames(contradicted.tolist())
-    return Estimate(matched, mapped, cut, links, has_picture_positions)
+    return Estimate(matched, mapped, EstimateTracks(cut, links, has_picture_positions))
 
 
 def refined_poses(run: Run, estimate: Estimate, image_set: ImageSet, keyed: ImageSet) -> Estimate:
@@ -217,18 +198,12 @@ def refined_poses(run: Run, estimate: Estimate, image_set: ImageSet, keyed: Imag
         keyed: the key images.
     """
     if len(keyed.sequence) < len(image_set.sequence):
-        resection = resection_stage(run, estimate.tracks, image_set, keyed, estimate.mapped)
+        resection = resection_stage(run, estimate.tracks.motion, image_set, keyed, estimate.mapped)
         estimate = replace(estimate, resection=resection)
     if run.options.moving != "keep":
-        dynamic = dynamic_stage(run, estimate.tracks, image_set, estimate.last)
-        masks = read_dynamic_masks(run.stages)
-        estimate = replace(estimate, dynamic=dynamic, dynamic_masks=masks)
-    masks = estimate.dynamic_masks
-    estimate = replace(
-        estimate,
-        tracks=without_dynamic_tracks(estimate.tracks, image_set, masks, run),
-        link_tracks=without_dynamic_links(estimate.link_tracks, image_set, masks),
-    )
+        dynamic = dynamic_stage(run, estimate.tracks.motion, image_set, estimate.last)
+        tracks = without_dynamic(run, estimate.tracks, image_set, dynamic)
+        estimate = replace(estimate, dynamic=dynamic, tracks=tracks)
     if not run.options.poses.adjust:
         return estimate
     return _adjusted(run, estimate, image_set, estimate.last)
@@ -241,12 +216,8 @@ def _adjusted(
     adjustment = adjustment_stage(
         run,
         estimate.tracks,
-        estimate.link_tracks,
         image_set,
         poses,
-        dynamic_masks=estimate.dynamic_masks,
-        masks_digest=estimate.masks_digest,
-        has_picture_positions=estimate.has_picture_positions,
         is_fast=bool(estimate.matches.result.links.fast),
         is_assumed=estimate.matches.result.assumes_focal_length and number == 1,
         number=number,
@@ -282,7 +253,7 @@ def remapped_poses(
         least_kept: the second mapping is rejected if a smaller share of the observations agrees
             with it.
     """
-    if estimate.adjustment is None or not estimate.has_picture_positions:
+    if estimate.adjustment is None or not estimate.tracks.has_picture_positions:
         return estimate
     again = remap_stage(run, image_set, estimate.mapped, estimate.adjustment)
     if not again.result.fits(least_kept):
@@ -300,9 +271,7 @@ def _long_range_check(
         run,
         estimate.tracks,
         image_set,
-        estimate.dynamic_masks,
         estimate.last,
-        masks_digest=estimate.masks_digest,
         searched_loops=estimate.matches.result.links.searched_loops,
         number=number,
     )
@@ -344,7 +313,7 @@ def split_at_seams(
             positions are removed even if there are no such seams.
     """
     may_bend = is_further
-    whole = estimate.tracks
+    whole = estimate.tracks.motion
     for number in count(_FIRST_SPLIT):
         if estimate.adjustment is None:
             break
@@ -361,7 +330,7 @@ def split_at_seams(
                 estimate.adjustment,
                 seams,
                 leaps=leaps,
-                tracks=estimate.tracks,
+                tracks=estimate.tracks.motion,
                 whole=whole,
                 rival=estimate.rival,
                 number=number,
@@ -406,8 +375,8 @@ def _largest_part(
         number: number of the adjustment.
     """
     frame_of = image_set.images.frame_of
-    tracks = estimate.tracks.split_after_frames([frame_of[first] for first, _ in cut])
-    estimate = replace(estimate, mapped=parts, tracks=tracks)
+    motion = estimate.tracks.motion.split_after_frames([frame_of[first] for first, _ in cut])
+    estimate = replace(estimate, mapped=parts, tracks=replace(estimate.tracks, motion=motion))
     estimate = _adjusted(run, estimate, image_set, parts, number=number)
     is_checked = estimate.long_range is not None
     return _long_range_check(run, estimate, image_set, number=number) if is_checked else estimate

@@ -112,7 +112,7 @@ def further_poses(
                 own_poses,
                 read_tracks(),
                 image_set,
-                has_picture_positions=first.has_picture_positions,
+                has_picture_positions=first.tracks.has_picture_positions,
             )
             estimate = refined_poses(own, estimate, some, _named(image_set, known))
             if map_again:

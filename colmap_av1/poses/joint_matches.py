@@ -195,7 +195,7 @@ def match_jointly(
         focal_length=_focal_length(run, cameras[0]),
         matched=matched,
         links=matches.links,
-        link_tracks=estimate.link_tracks,
+        link_tracks=estimate.tracks.links,
         track_lengths=paired.track_lengths,
         depth=matches.depth,
         warnings=(*matches.warnings, *warnings),
@@ -239,7 +239,7 @@ def _model_of(run: Run, estimate: Estimate, image_set: ImageSet) -> _Model:
     assert estimate.adjustment is not None  # `match` always adjusts
     known = read_poses(run, estimate.last)
     registered = posed_images_of(known, image_set)
-    tracks = run.pose_tracks(estimate.tracks).keep_frames(registered.frames)
+    tracks = run.pose_tracks(estimate.tracks.motion).keep_frames(registered.frames)
     return _Model(run, estimate.adjustment.result, known, registered, tracks)
 
 

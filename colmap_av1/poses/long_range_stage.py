@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from colmap_av1.geometry.masks import Mask
 from colmap_av1.images.image_set import ImageSet
+from colmap_av1.poses.estimate_tracks import EstimateTracks
 from colmap_av1.poses.long_range import LongRangeCheck, LongRangeErrors
 from colmap_av1.poses.posed_images import (
     FOR_POSES,
@@ -48,12 +47,10 @@ class LongRangeResult:
 
 def long_range_stage(
     run: Run,
-    tracks: Tracks,
+    tracks: EstimateTracks,
     image_set: ImageSet,
-    dynamic_masks: Mapping[str, Mask],
     poses: Kept[PosesResult],
     *,
-    masks_digest: str | None,
     searched_loops: bool,
     number: int,
 ) -> Kept[LongRangeResult]:
@@ -61,18 +58,16 @@ def long_range_stage(
 
     Args:
         run: inputs and options of the run.
-        tracks: the tracks of all sequences.
+        tracks: the tracks of all videos, without dynamic pixels.
         image_set: the images.
-        dynamic_masks: masks that exclude dynamic pixels, by image name.
         poses: the stage that estimated the poses.
-        masks_digest: digest of the stage that made the masks; None without masks.
         searched_loops: whether loop closures have been searched in all videos.
         number: 1 for the check of the whole model, else the number of the adjustment after a split.
     """
 
     def make(_: Path) -> LongRangeResult:
-        registered = read_posed_images(run, poses, image_set.masked_by(dynamic_masks))
-        errors = _compared(run, tracks, image_set, registered)
+        registered = read_posed_images(run, poses, image_set.masked_by(tracks.dynamic_masks))
+        errors = _compared(run, tracks.motion, image_set, registered)
         return LongRangeResult(
             median=errors.median,
             largest=errors.largest,
@@ -83,7 +78,7 @@ def long_range_stage(
     return run_stage(
         run.stages,
         f"long_range_{number}" if number > 1 else "long_range",
-        [poses.digest, masks_digest, searched_loops],
+        [poses.digest, tracks.masks_digest, searched_loops],
         LongRangeResult,
         products=[],
         make=make,

@@ -35,13 +35,12 @@ def tracks_of_unregistered(
         not_registered: names of the images that are not registered.
         density: which motion tracks are selected.
     """
+    motion = estimate.tracks.motion
     if not not_registered:
-        return Tracks.empty(
-            estimate.tracks.num_frames, (estimate.tracks.width, estimate.tracks.height)
-        )
+        return Tracks.empty(motion.num_frames, (motion.width, motion.height))
     frames, frame_of = image_set.images.frames, image_set.images.frame_of
-    motion = select_tracks(run.pose_tracks(estimate.tracks).keep_frames(frames), density)
-    seen = Tracks.concatenate(motion, estimate.link_tracks.keep_frames(frames))
+    some = select_tracks(run.pose_tracks(motion).keep_frames(frames), density)
+    seen = Tracks.concatenate(some, estimate.tracks.links.keep_frames(frames))
     is_wanted = np.isin(seen.frame, [frame_of[name] for name in not_registered])
     return seen.keep_tracks(seen.having(is_wanted))
 

@@ -33,6 +33,7 @@ from colmap_av1.geometry.undistortion import (
 from colmap_av1.images.files import read_image, write_image, write_images
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses.dynamic.short_tracks import static_points
+from colmap_av1.poses.estimate_tracks import EstimateTracks
 from colmap_av1.poses.posed_images import (
     PosedImages,
     PosesResult,
@@ -250,18 +251,16 @@ class ModelResult:
 
 def model_stage(
     run: Run,
-    tracks: Tracks,
+    tracks: EstimateTracks,
     image_set: ImageSet,
-    dynamic_masks: Mapping[str, Mask],
     poses: Kept[PosesResult],
 ) -> Kept[ModelResult]:
     """Triangulate all tracks, and write the undistorted images and the model.
 
     Args:
         run: inputs and options of the run.
-        tracks: the tracks of all sequences, without those on dynamic objects.
+        tracks: the tracks of all videos, without dynamic pixels.
         image_set: all images.
-        dynamic_masks: masks that exclude dynamic pixels, by image name.
         poses: the stage that estimated the poses.
     """
     options, clock = run.options, run.clock
@@ -273,12 +272,14 @@ def model_stage(
         images = registered.images
         masks = registered.image_set.masks
         given = undistorted_masks(masks, registered.camera_of_image, cameras)
-        joined = registered.image_set.masked_by(dynamic_masks).masks
+        joined = registered.image_set.masked_by(tracks.dynamic_masks).masks
         valid = undistorted_masks(joined, registered.camera_of_image, cameras)
         views = views_of(images, cameras, valid)
         with clock.measure("points"):
-            tracked, agreement = _tracked_points(run, registered, views, tracks)
-            shows_dynamic = np.array([image.name in dynamic_masks for image in images])
+            tracked, agreement = _tracked_points(
+                run, registered, views, Tracks.concatenate(tracks.motion, tracks.links)
+            )
+            shows_dynamic = np.array([image.name in tracks.dynamic_masks for image in images])
             tracked = tracked.take(static_points(tracked, shows_dynamic))
         undistort = _undistortions(registered, cameras)
         cloud = _written_cloud(

@@ -59,8 +59,7 @@ def written_model(
 ) -> tuple[Kept[PlaceResult], Kept[ModelResult]]:
     """Place the model in the world, and write it with the points of all tracks."""
     placed = place_stage(run, image_set, estimate.last, positions)
-    tracks = Tracks.concatenate(estimate.tracks, estimate.link_tracks)
-    return placed, model_stage(run, tracks, image_set, estimate.dynamic_masks, placed)
+    return placed, model_stage(run, estimate.tracks, image_set, placed)
 
 
 def further_models(

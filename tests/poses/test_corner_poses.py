@@ -20,6 +20,7 @@ from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import PoseOptions
 from colmap_av1.poses.adjustment_stage import adjustment_stage
 from colmap_av1.poses.corners.in_images import resect_from_corners
+from colmap_av1.poses.estimate_tracks import EstimateTracks
 from colmap_av1.poses.posed_images import PosedImages, PosesResult
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.tracks import Tracks
@@ -129,13 +130,9 @@ def test_links_join_images_across_a_gap_in_the_tracks(
     )
     adjusted = adjustment_stage(
         run,
-        tracks,
-        links,
+        EstimateTracks(tracks, links, has_picture_positions=True),
         registered.image_set,
         Kept(PosesResult("registered.npz", NUM_IMAGES), "", resumed=False),
-        dynamic_masks={},
-        masks_digest=None,
-        has_picture_positions=True,
     )
     found = read_posed_model(tmp_path / adjusted.result.poses).by_name
     centres = camera_centres(np.array([found[i.name].cam_from_world for i in registered.images]))

@@ -19,6 +19,7 @@ from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.options import CameraOptions, MatchOptions, ReconstructOptions
 from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.estimate_steps import Estimate
+from colmap_av1.poses.estimate_tracks import EstimateTracks
 from colmap_av1.poses.further_models import further_poses, keeps_intrinsics
 from colmap_av1.poses.mapping_stage import MappedResult
 from colmap_av1.poses.match_stage import MatchesResult
@@ -142,13 +143,8 @@ def parts_of_second(
     estimate = Estimate(
         matches=Kept(matches, "matches", False),
         mapped=Kept(mapped, "mapped", False),
-        resection=None,
-        dynamic=None,
+        tracks=EstimateTracks(nothing, nothing, has_picture_positions=False),
         adjustment=Kept(adjusted, "adjusted", False),
-        tracks=nothing,
-        link_tracks=nothing,
-        dynamic_masks={},
-        has_picture_positions=False,
     )
     options = ReconstructOptions(
         match=MatchOptions(camera=CameraOptions("SIMPLE_PINHOLE", single_camera=single_camera)),

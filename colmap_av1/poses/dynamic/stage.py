@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from colmap_av1.images.track_images import MIN_IMAGES
 from colmap_av1.options import DensityOptions, TriangulateOptions
 from colmap_av1.poses.dynamic.contradictions import tracks_in_cells
 from colmap_av1.poses.dynamic.regions import dynamic_cells, mask_of_cells
+from colmap_av1.poses.estimate_tracks import EstimateTracks
 from colmap_av1.poses.posed_images import PosedImages, PosesResult, read_posed_images
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.selection import select_tracks
@@ -73,7 +74,23 @@ def dynamic_stage(
     )
 
 
-def read_dynamic_masks(stages: Path) -> dict[str, Mask]:
+def without_dynamic(
+    run: Run, tracks: EstimateTracks, image_set: ImageSet, dynamic: Kept[DynamicResult]
+) -> EstimateTracks:
+    """The tracks without the dynamic pixels that a stage found, and with its masks."""
+    masks = _read_dynamic_masks(run.stages)
+    if not masks:
+        return tracks
+    return replace(
+        tracks,
+        motion=without_dynamic_tracks(tracks.motion, image_set, masks, run),
+        links=without_dynamic_links(tracks.links, image_set, masks),
+        dynamic_masks=masks,
+        masks_digest=dynamic.digest,
+    )
+
+
+def _read_dynamic_masks(stages: Path) -> dict[str, Mask]:
     """Masks that exclude dynamic pixels, by image name; only of images that have such pixels."""
     with np.load(stages / _FILE) as file:
         packed = np.split(file["packed"], file["ends"][:-1]) if len(file["names"]) else []
