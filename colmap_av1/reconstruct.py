@@ -310,7 +310,6 @@ def _run_stages(run: Run) -> ReconstructReport:
     del videos  # These tracks are as large as those in `estimate`.
     placed, written = written_model(run, estimate, image_set, positions)
     further, not_registered = further_models(run, estimate, image_set, positions)
-    assert estimate.long_range is not None
     matches, poses, model = estimate.matches.result, estimate.last.result, written.result
     registered = read_poses(run, estimate.last)
     with run.clock.measure("adjustment"):
@@ -442,7 +441,7 @@ def _warnings(
         )
     if matches.depth.warning is not None:
         warnings.append(matches.depth.warning)
-    if estimate.long_range is not None and estimate.long_range.result.warning is not None:
+    if estimate.long_range.result.warning is not None:
         warnings.append(estimate.long_range.result.warning)
     if estimate.adjustment is not None and estimate.adjustment.result.seams_warning is not None:
         warnings.append(estimate.adjustment.result.seams_warning)

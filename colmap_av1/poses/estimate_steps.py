@@ -17,7 +17,7 @@ from colmap_av1.poses.adjustment_stage import AdjustedResult, adjustment_stage
 from colmap_av1.poses.dynamic.stage import DynamicResult, dynamic_stage, without_dynamic
 from colmap_av1.poses.estimate_tracks import EstimateTracks
 from colmap_av1.poses.false_links import leaping_seams
-from colmap_av1.poses.long_range_stage import LongRangeResult, long_range_stage
+from colmap_av1.poses.long_range_stage import NOT_CHECKED, LongRangeResult, long_range_stage
 from colmap_av1.poses.mapping_stage import MappedResult, mapping_stage, with_model_first
 from colmap_av1.poses.match_stage import MatchesResult, match_stage, read_links
 from colmap_av1.poses.parts import certain_stage, split_stage
@@ -49,7 +49,7 @@ class Estimate:
         resection: the poses of the images in between; None if all images are key images.
         dynamic: the dynamic objects; None if they were not looked for.
         adjustment: the adjusted poses; None if they are not adjusted.
-        long_range: the long-range check; None if it was not made.
+        long_range: the long-range check; `NOT_CHECKED` before it, and for further models.
         rival: the adjustment of the first mapping if a second one replaced it, but fits the
             observations hardly better; else None.
     """
@@ -60,7 +60,7 @@ class Estimate:
     resection: Kept[PosesResult] | None = None
     dynamic: Kept[DynamicResult] | None = None
     adjustment: Kept[AdjustedResult] | None = None
-    long_range: Kept[LongRangeResult] | None = None
+    long_range: Kept[LongRangeResult] = NOT_CHECKED
     rival: Kept[AdjustedResult] | None = None
 
     @property
@@ -71,13 +71,12 @@ class Estimate:
     @property
     def is_contradicted(self) -> bool:
         """Whether pictures far apart in time contradict the poses."""
-        return self.long_range is not None and self.long_range.result.contradicts_poses
+        return self.long_range.result.contradicts_poses
 
     @property
     def is_confirmed(self) -> bool:
         """Whether pictures far apart in time agree with the poses."""
-        is_checked = self.long_range is not None and self.long_range.result.median is not None
-        return is_checked and not self.is_contradicted
+        return self.long_range.result.median is not None and not self.is_contradicted
 
     @property
     def seams_to_split(self) -> list[tuple[str, str]]:
@@ -378,5 +377,5 @@ def _largest_part(
     motion = estimate.tracks.motion.split_after_frames([frame_of[first] for first, _ in cut])
     estimate = replace(estimate, mapped=parts, tracks=replace(estimate.tracks, motion=motion))
     estimate = _adjusted(run, estimate, image_set, parts, number=number)
-    is_checked = estimate.long_range is not None
+    is_checked = estimate.long_range is not NOT_CHECKED
     return _long_range_check(run, estimate, image_set, number=number) if is_checked else estimate

@@ -145,8 +145,6 @@ def match_jointly(
     if density.max_sigma is None:
         density = replace(density, max_sigma=0.0)  # the poses show which tracks have drifted
     estimate = estimate_poses(run, videos, image_set)
-    assert estimate.long_range is not None
-    long_range = estimate.long_range.result
     models = [_model_of(run, estimate, image_set)]
     # A second mapping would join images across turns, which the mapper of the database then bends.
     lost = set[str]()
@@ -180,6 +178,7 @@ def match_jointly(
         run, image_set, [(m.known, {i.name for i in m.registered.images}) for m in models]
     )
     matched = verify_images(paired, cameras, run.options.match.verify, run.context)
+    long_range = estimate.long_range.result
     warnings = _warnings(long_range, models, not_registered, others, image_set)
     if first.adjusted.seams_warning is not None:
         warnings.append(first.adjusted.seams_warning)

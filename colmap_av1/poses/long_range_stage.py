@@ -45,6 +45,14 @@ class LongRangeResult:
     contradicts_poses: bool
 
 
+# In place of the result for models that are not checked.
+NOT_CHECKED = Kept(
+    LongRangeResult(median=None, largest=None, warning=None, contradicts_poses=False),
+    digest="",
+    resumed=False,
+)
+
+
 def long_range_stage(
     run: Run,
     tracks: EstimateTracks,
