@@ -152,6 +152,11 @@ def with_initial_intrinsics(camera: pycolmap.Camera) -> pycolmap.Camera:
     return initial
 
 
+def assumes_focal_length(cameras: Iterable[pycolmap.Camera]) -> bool:
+    """Whether the focal length of a camera is assumed, neither estimated nor given."""
+    return not all(camera.has_prior_focal_length for camera in cameras)
+
+
 def with_known_focal_lengths(cameras: Sequence[pycolmap.Camera]) -> list[pycolmap.Camera]:
     """Copies of the cameras whose focal length counts as known.
 

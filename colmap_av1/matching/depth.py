@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.geometry.cameras import assumes_focal_length
 from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.util.arrays import Floats
 
@@ -128,7 +129,7 @@ def depth_evidence(
     return DepthEvidence(
         len(parallax),
         int(np.sum(np.array(parallax) > _LEAST_PARALLAX)),
-        all(camera.has_prior_focal_length for camera in cameras if camera is not None),
+        not assumes_focal_length(camera for camera in cameras if camera is not None),
     )
 
 

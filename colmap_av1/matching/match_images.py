@@ -69,11 +69,6 @@ class ImageMatches:
     depth: DepthEvidence
     warnings: tuple[str, ...]
 
-    @property
-    def assumes_focal_length(self) -> bool:
-        """Whether the focal length of an image is assumed."""
-        return not all(camera.has_prior_focal_length for camera in self.cameras)
-
 
 def match_images(
     image_set: ImageSet,

@@ -218,7 +218,7 @@ def _adjusted(
         image_set,
         poses,
         is_fast=bool(estimate.matches.result.links.fast),
-        is_assumed=estimate.matches.result.assumes_focal_length and number == 1,
+        is_assumed=estimate.matches.result.assumes_video_focal_length and number == 1,
         number=number,
     )
     return replace(estimate, adjustment=adjustment)
@@ -233,7 +233,9 @@ def _is_doubtful(estimate: Estimate) -> bool:
     if estimate.adjustment is None:
         return False
     matches, adjusted = estimate.matches.result, estimate.adjustment.result
-    uncertain = adjusted.doubtful_seams or adjusted.scale_lost_seams or matches.assumes_focal_length
+    uncertain = (
+        adjusted.doubtful_seams or adjusted.scale_lost_seams or matches.assumes_video_focal_length
+    )
     may_bend = (matches.links.gaps or matches.links.fast) and uncertain
     return bool(adjusted.has_long_focal_length or may_bend)
 

@@ -111,14 +111,14 @@ class JointMatches(ImageMatches):
     poses: list[list[Floats | None]]
 
     @property
-    def assumes_focal_length(self) -> bool:
-        """Whether the focal length of a registered image is assumed."""
-        return not all(
-            camera.has_prior_focal_length
+    def registered_cameras(self) -> list[pycolmap.Camera]:
+        """The cameras of the registered images."""
+        return [
+            camera
             for poses in self.poses
             for camera, pose in zip(self.cameras, poses, strict=True)
             if pose is not None
-        )
+        ]
 
 
 def match_jointly(

@@ -10,7 +10,7 @@ import numpy as np  # noqa: F401 - before pycolmap: else writing PNG files fails
 import pycolmap
 
 from colmap_av1.errors import ModelError
-from colmap_av1.geometry.cameras import with_known_focal_lengths
+from colmap_av1.geometry.cameras import assumes_focal_length, with_known_focal_lengths
 from colmap_av1.matching.initial_pairs import prepare_start
 from colmap_av1.matching.mapper_limits import FORWARD_MOTION, InitialLimits
 from colmap_av1.matching.match_images import ImageMatches
@@ -54,8 +54,12 @@ def choose_mapper_start(
         clock: gets the stage "verification".
         keep_cameras: the cameras are those of an existing database, which do not change.
     """
-    poses = found.poses if isinstance(found, JointMatches) else []
-    is_assumed = found.assumes_focal_length
+    joint = found if isinstance(found, JointMatches) else None
+    poses = joint.poses if joint is not None else []
+    # The cameras of images that the joint estimate does not register do not count.
+    is_assumed = assumes_focal_length(
+        joint.registered_cameras if joint is not None else found.cameras
+    )
     # The poses of pairs are wrong if a focal length is assumed.
     start = prepare_start(found.matched, found.cameras, clock, [] if is_assumed else poses)
     cameras, known_cameras = found.cameras, with_known_focal_lengths(found.cameras)

@@ -58,11 +58,11 @@ def mapping_stage(
     mappers: list[Literal["incremental", "global"]]
     if pose_options.mapper != "auto":
         mappers = [pose_options.mapper]
-    else:
+    elif found_before.assumes_video_focal_length:
         # The global mapper needs the focal length. A zoom would mislead its estimate.
-        mappers = (
-            ["incremental"] if found_before.assumes_focal_length else ["global", "incremental"]
-        )
+        mappers = ["incremental"]
+    else:
+        mappers = ["global", "incremental"]
     links = found_before.links
     reasons = {reason for gap in links.gaps for reason in gap.reasons}
     depends_on_links = links.num_between or reasons & {"contradicted", "few tracks"}
@@ -215,7 +215,7 @@ def _why_no_model(found: MatchesResult, mapper: str, camera: CameraOptions) -> s
             f"{found.num_verified_pairs} of {found.num_pairs} verified pairs: "
             "see 'colmap-av1 info' for what the stream lacks, or convert it again with --reencode 1"
         )
-    if found.assumes_focal_length:
+    if found.assumes_video_focal_length:
         return (
             f"{failure}: the focal length is a default and may be far off, or there is too little "
             f"parallax, as when the camera moves along its optical axis: {give}"

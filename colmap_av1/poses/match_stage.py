@@ -11,6 +11,7 @@ import numpy as np  # before pycolmap: the other order breaks writing PNG files 
 from numpy.typing import NDArray
 
 from colmap_av1.database.writing import write_matches
+from colmap_av1.geometry.cameras import assumes_focal_length
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.matching.cameras import ImageCameras, new_cameras
 from colmap_av1.matching.depth import DepthEvidence
@@ -38,7 +39,8 @@ class MatchesResult:
         warnings: warnings about cameras and links.
         key_images: indices of the key images.
         num_pose_tracks: number of motion tracks by which the key images are matched.
-        assumes_focal_length: whether the focal length of some video is assumed.
+        assumes_video_focal_length: whether the focal length of a video is assumed; photos do not
+            count.
         forward_motion: whether the camera moves along its optical axis, see `MatchReport`.
         depth: whether the matches determine depth.
         num_pairs: number of image pairs.
@@ -51,7 +53,7 @@ class MatchesResult:
     warnings: tuple[str, ...]
     key_images: tuple[int, ...]
     num_pose_tracks: int
-    assumes_focal_length: bool
+    assumes_video_focal_length: bool
     forward_motion: bool
     depth: DepthEvidence
     num_pairs: int
@@ -123,7 +125,6 @@ def match_stage(
                 places=run.positions.places[index] if run.positions is not None else None,
             )
         _write_links(partial / run.stages.name, found)
-        of_videos = cameras[: keyed.photos.start]
         configs = [geometry.config for geometry in matched.geometries]
         num_keypoints = sum(len(k.xy) for k in matched.keypoints)
         return MatchesResult(
@@ -131,7 +132,7 @@ def match_stage(
             warnings=found.warnings,
             key_images=tuple(index),
             num_pose_tracks=len(found.track_lengths),
-            assumes_focal_length=not all(camera.has_prior_focal_length for camera in of_videos),
+            assumes_video_focal_length=assumes_focal_length(cameras[: keyed.photos.start]),
             forward_motion=matched.forward_motion,
             depth=found.depth,
             num_pairs=len(configs),

@@ -130,7 +130,7 @@ def parts_of_second(
         warnings=(),
         key_images=tuple(range(len(names))),
         num_pose_tracks=tracks.num_tracks,
-        assumes_focal_length=False,
+        assumes_video_focal_length=False,
         forward_motion=False,
         depth=DepthEvidence(0, 0, is_focal_length_known=False),
         num_pairs=0,

@@ -89,7 +89,7 @@ def map_scene(scene: Scene, params: str, folder: Path, *, is_assumed: bool = Fal
         warnings=(),
         key_images=tuple(range(NUM_IMAGES)),
         num_pose_tracks=scene.tracks.num_tracks,
-        assumes_focal_length=is_assumed,
+        assumes_video_focal_length=is_assumed,
         forward_motion=False,
         depth=DepthEvidence(0, 0, is_focal_length_known=not is_assumed),
         num_pairs=len(configs),
