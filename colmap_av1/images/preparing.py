@@ -184,19 +184,28 @@ def prepare_images(
         if not existing and kept:
             # Another program may have numbered other frames than the pattern does.
             some = [kept[0], kept[min(_CHECKED, len(kept) - 1)]]
-            _check_files(prepared, dict(some), options.reading, context)
+            _check_files(prepared, some, options.reading, context)
     return prepared
 
 
 def _check_files(
-    prepared: PreparedImages, frame_of: Mapping[Path, int], read: ReadOptions, context: RunContext
+    prepared: PreparedImages,
+    images: Sequence[tuple[Path, int]],
+    read: ReadOptions,
+    context: RunContext,
 ) -> None:
-    """Check that image files show their frames of the video, given in ascending order.
+    """Check that image files show their frames of the video.
+
+    Args:
+        prepared: the images of the video.
+        images: each file, and the frame that it should show, in ascending order of frames.
+        read: how the video is decoded.
+        context: its progress is called.
 
     Raises:
         ImageError: an image shows something else.
     """
-    files, frames = list(frame_of), list(frame_of.values())
+    files, frames = [file for file, _ in images], [frame for _, frame in images]
     pictures = decode_pictures(
         prepared.source,
         prepared.tracked.tracks.num_frames,
@@ -268,7 +277,7 @@ def write_all_prepared(
         for name, frame in zip(chosen.names, chosen.frames.tolist(), strict=True):
             path = own_folder / name
             if path not in before and path.exists():
-                _check_files(own, {path: frame}, read, context)
+                _check_files(own, [(path, frame)], read, context)
                 break
     num_written = copy_photos(prepared.inputs.photos, folder)
     warnings = list[str]()

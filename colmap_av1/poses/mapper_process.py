@@ -51,6 +51,7 @@ class MappingSettings(MapperSettings):
     """Settings of `run_mapping`.
 
     Attributes:
+        task: what `run_child` does with the settings.
         image_path: folder of the images, for the colours of points; None leaves them black.
         growth: all images are adjusted whenever their number or that of points has grown by this
             factor; None: COLMAP's default.
@@ -67,6 +68,7 @@ class StartSettings(MapperSettings):
     """Settings of a start of the incremental mapper, see `start_mapper`.
 
     Attributes:
+        task: what `run_child` does with the settings.
         num_images: number of images at which the mapper is stopped.
     """
 
@@ -75,7 +77,11 @@ class StartSettings(MapperSettings):
 
 
 class AdjustmentSettings(TypedDict):
-    """Settings of a bundle adjustment, see the arguments of `adjust_model`."""
+    """Settings of a bundle adjustment, see the arguments of `adjust_model`.
+
+    Attributes:
+        task: what `run_child` does with the settings.
+    """
 
     task: Literal["adjustment"]
     model: str
