@@ -35,6 +35,33 @@ MIN_IMAGES = 2
 
 
 @dataclass(frozen=True)
+class VideoTracks:
+    """Tracks and images of a video, as far as matching and the estimate of poses use them.
+
+    Attributes:
+        tracks: its tracks, in pixels of the images.
+        chosen: the frames that are images.
+        inter_share: see `TrackedVideo`.
+        fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
+        read_out: see `TrackedVideo`.
+        digest: digest of the stage that stores them; empty if they are not stored.
+    """
+
+    tracks: Tracks
+    chosen: ChosenImages
+    inter_share: NDArray[np.float32]
+    fast: Bools
+    read_out: float | None
+    digest: str = ""
+
+    def doubted_at(self, frames: Sequence[int]) -> VideoTracks:
+        """A copy in which the motion of some frames is unreliable, as if they were intra-coded."""
+        share = self.inter_share.copy()
+        share[list(frames)] = 0.0
+        return replace(self, inter_share=share)
+
+
+@dataclass(frozen=True)
 class TrackedImages:
     """The tracks of a video and the frames that are images.
 
@@ -52,6 +79,12 @@ class TrackedImages:
     def tracks(self) -> Tracks:
         """The tracks of the video."""
         return self.video.tracks
+
+    @property
+    def for_matching(self) -> VideoTracks:
+        """What matching and the estimate of poses use."""
+        video = self.video
+        return VideoTracks(video.tracks, self.chosen, video.inter_share, self.fast, video.read_out)
 
     def with_tracks(self, tracks: Tracks) -> TrackedImages:
         """The same with other tracks."""

@@ -8,10 +8,10 @@ from functools import partial
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from colmap_av1.errors import VideoError
 from colmap_av1.images.image_set import ImageSet, Pictures
+from colmap_av1.images.track_images import VideoTracks
 from colmap_av1.matching.cameras import ImageCameras
 from colmap_av1.matching.depth import DepthEvidence, depth_of_images
 from colmap_av1.matching.links.link_images import link_images
@@ -26,23 +26,8 @@ from colmap_av1.matching.matched_images import (
 from colmap_av1.matching.pairs import schedule_pairs
 from colmap_av1.options import MatchOptions
 from colmap_av1.tracks.tracks import Tracks, least_length
-from colmap_av1.util.arrays import Bools, Ints
+from colmap_av1.util.arrays import Ints
 from colmap_av1.util.run_context import RunContext
-
-
-@dataclass(frozen=True)
-class SelectedTracks:
-    """The tracks of a video along which its images are matched.
-
-    Attributes:
-        tracks: the selected tracks.
-        inter_share: float32 [num_frames], see `TrackedVideo`.
-        fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
-    """
-
-    tracks: Tracks
-    inter_share: NDArray[np.float32]
-    fast: Bools
 
 
 @dataclass(frozen=True)
@@ -72,7 +57,7 @@ class ImageMatches:
 
 def match_images(
     image_set: ImageSet,
-    videos: Sequence[SelectedTracks],
+    videos: Sequence[VideoTracks],
     cameras: Callable[[PairedImages], ImageCameras],
     pictures: Pictures,
     *,
@@ -85,7 +70,8 @@ def match_images(
 
     Args:
         image_set: the images.
-        videos: the tracks of each video.
+        videos: for each video, the tracks that are selected for matching; `image_set` may have
+            only some of its images.
         cameras: returns the cameras of the images, which may depend on the matches.
         pictures: returns the pictures of images, for links.
         options: options of pairs, verification and links.
@@ -131,7 +117,7 @@ def match_images(
 
 def pair_videos(
     image_set: ImageSet,
-    videos: Sequence[SelectedTracks],
+    videos: Sequence[VideoTracks],
     options: MatchOptions,
     context: RunContext,
     name: str,

@@ -15,6 +15,7 @@ from typing import Any, Generic, Literal, TypeVar
 from colmap_av1.errors import ModelError, VideoError
 from colmap_av1.geometry.posed_model import read_posed_model
 from colmap_av1.images.image_set import ImageSet
+from colmap_av1.images.track_images import VideoTracks
 from colmap_av1.poses.estimate_steps import (
     Estimate,
     KeyImageModels,
@@ -25,7 +26,6 @@ from colmap_av1.poses.estimate_steps import (
 from colmap_av1.poses.mapping_stage import num_nearest
 from colmap_av1.poses.match_stage import matches_key
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.util.stages import run_stage
 
 _Value = TypeVar("_Value")

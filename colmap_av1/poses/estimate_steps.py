@@ -13,6 +13,7 @@ from itertools import count
 
 from colmap_av1.errors import ModelError
 from colmap_av1.images.image_set import ImageSet
+from colmap_av1.images.track_images import VideoTracks
 from colmap_av1.poses.adjustment_stage import AdjustedResult, adjustment_stage
 from colmap_av1.poses.dynamic.stage import DynamicResult, dynamic_stage, without_dynamic
 from colmap_av1.poses.estimate_tracks import EstimateTracks
@@ -25,7 +26,6 @@ from colmap_av1.poses.posed_images import PosesResult, read_poses
 from colmap_av1.poses.remapping import remap_stage
 from colmap_av1.poses.resection_stage import resection_stage
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.images.image_set import ImageSet
+from colmap_av1.images.track_images import VideoTracks
 from colmap_av1.matching.mapper_limits import POINT_MIN_ANGLE
 from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.matched_images import PairedImages, pair_by_tracks, verify_images
@@ -40,7 +41,6 @@ from colmap_av1.poses.matched_observations import (
 from colmap_av1.poses.posed_images import PosedImages, posed_images_of, read_poses, triangulate_in
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.track_matches import at_same_place, tracks_of_model
-from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.poses.unregistered import models_of_images, tracks_of_unregistered, within_models
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks

@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
-from colmap_av1.images.choosing import ChosenImages
 from colmap_av1.images.key_images import key_images
+from colmap_av1.images.track_images import VideoTracks
 from colmap_av1.matching.links.plan import images_to_link
 from colmap_av1.poses.run import Run
-from colmap_av1.tracks.tracks import Tracks
-from colmap_av1.util.arrays import Bools, Ints
+from colmap_av1.util.arrays import Ints
 
 
-def key_images_of_video(
-    run: Run,
-    tracks: Tracks,
-    chosen: ChosenImages,
-    inter_share: NDArray[np.float32],
-    fast: Bools,
-) -> Ints:
-    """Indices of the key images among some images of a video.
-
-    Args:
-        run: the run.
-        tracks: tracks of the video.
-        chosen: the images.
-        inter_share: see `TrackedVideo`.
-        fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
-    """
+def key_images_of_video(run: Run, video: VideoTracks) -> Ints:
+    """Indices of the key images among the images of a video."""
     pose_options, links = run.options.poses, run.options.match.links
-    always = images_to_link(inter_share, chosen.frames, links)
+    frames = video.chosen.frames
+    always = images_to_link(video.inter_share, frames, links)
     if links.links != "none":
-        always |= fast[chosen.frames]
+        always |= video.fast[frames]
     return key_images(
-        tracks,
-        chosen.frames,
+        video.tracks,
+        frames,
         always,
         spacing=pose_options.pose_spacing,
         num_cells=pose_options.pose_tracks_per_image,

@@ -10,12 +10,11 @@ from colmap_av1.images.image_set import ImageSet, pictures_of
 from colmap_av1.images.preparing import PreparedInputs
 from colmap_av1.images.track_images import MIN_IMAGES
 from colmap_av1.matching.cameras import ImageCameras, new_cameras
-from colmap_av1.matching.match_images import ImageMatches, SelectedTracks, match_images
+from colmap_av1.matching.match_images import ImageMatches, match_images
 from colmap_av1.matching.matched_images import PairedImages
 from colmap_av1.options import ImageOptions, MatchOptions, PairOptions, ReconstructOptions
 from colmap_av1.poses.joint_matches import JointMatches, match_jointly
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.util.files import STAGES
 from colmap_av1.util.run_context import RunContext
 
@@ -121,16 +120,7 @@ def _match_jointly(
         context=context,
         cameras=cameras,
     )
-    videos = [
-        VideoTracks(
-            tracks=own.tracked.tracks,
-            chosen=own.tracked.chosen,
-            inter_share=own.tracked.video.inter_share,
-            fast=own.tracked.fast,
-            read_out=own.tracked.video.read_out,
-        )
-        for own in prepared.videos
-    ]
+    videos = [own.tracked.for_matching for own in prepared.videos]
     return match_jointly(run, videos, prepared.image_set, options.density)
 
 
@@ -150,10 +140,7 @@ def _match_pairs(
 
     return match_images(
         image_set,
-        [
-            SelectedTracks(own.tracked.tracks, own.tracked.video.inter_share, own.tracked.fast)
-            for own in prepared.videos
-        ],
+        [own.tracked.for_matching for own in prepared.videos],
         cameras_of,
         pictures_of(image_set, shown, [photo.path for photo in photos], options.reading),
         options=options,

@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from colmap_av1.database.writing import write_matches
 from colmap_av1.geometry.cameras import assumes_focal_length
 from colmap_av1.images.image_set import ImageSet
+from colmap_av1.images.track_images import VideoTracks
 from colmap_av1.matching.cameras import ImageCameras, new_cameras
 from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.links.report import LinkReport
-from colmap_av1.matching.match_images import ImageMatches, SelectedTracks, match_images, pair_videos
+from colmap_av1.matching.match_images import ImageMatches, match_images, pair_videos
 from colmap_av1.matching.matched_images import PairedImages
 from colmap_av1.matching.two_view_geometry import TwoViewConfig
 from colmap_av1.options import DensityOptions
 from colmap_av1.poses.key_images import key_images_of_video
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_stage import VideoTracks
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
@@ -161,9 +161,8 @@ def _key_images(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) ->
         return list(range(len(image_set.sequence)))
     index: list[int] = []
     for video, own in enumerate(videos):
-        frames = own.chosen.frames
-        tracks = run.pose_tracks(own.tracks).keep_frames(frames)
-        found = key_images_of_video(run, tracks, own.chosen, own.inter_share, own.fast)
+        tracks = run.pose_tracks(own.tracks).keep_frames(own.chosen.frames)
+        found = key_images_of_video(run, replace(own, tracks=tracks))
         index += (found + image_set.images_of(video).start).tolist()
     return [*index, *image_set.photos]
 
@@ -180,7 +179,7 @@ def _pose_density(run: Run) -> DensityOptions:
 
 def _selected_tracks(
     run: Run, videos: Sequence[VideoTracks], image_set: ImageSet
-) -> list[SelectedTracks]:
+) -> list[VideoTracks]:
     """A spread selection of the tracks of each video that poses are estimated from."""
     density = _pose_density(run)
     selected = []
@@ -188,7 +187,7 @@ def _selected_tracks(
         with run.clock.measure("pairs"):
             tracks = run.pose_tracks(own.tracks)
             sparse = select_tracks(tracks.keep_frames(image_set.of_video(video).frames), density)
-        selected.append(SelectedTracks(sparse, own.inter_share, own.fast))
+        selected.append(replace(own, tracks=sparse))
     return selected
 
 

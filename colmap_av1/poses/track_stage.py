@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from colmap_av1.images.names import image_names
 from colmap_av1.images.track_images import (
     ImageChoice,
     TrackedImages,
+    VideoTracks,
     track_chosen_images,
     track_images,
 )
@@ -29,7 +29,6 @@ from colmap_av1.poses.run import Run
 from colmap_av1.tracks.fast_frames import fast_frames
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.tracks.video_tracks import TrackedVideo, count_frames
-from colmap_av1.util.arrays import Bools
 from colmap_av1.util.digests import digest_if_there, file_digest
 from colmap_av1.util.progress import Clock
 from colmap_av1.util.spread import evenly_spread
@@ -46,33 +45,6 @@ _PIXELS_PER_OBSERVATION = 16
 # width in pixels: a quarter of the tracks that poses are estimated from.
 _FEWER = 4
 _SEEDING = 8
-
-
-@dataclass(frozen=True)
-class VideoTracks:
-    """Tracks and images of a video.
-
-    Attributes:
-        tracks: its tracks.
-        chosen: the frames that are images.
-        inter_share: see `TrackedVideo`.
-        fast: bool [num_frames] where the camera moves fast, see `fast_frames`.
-        read_out: see `TracksResult`.
-        digest: digest of the stage that stores them; empty if they are not stored.
-    """
-
-    tracks: Tracks
-    chosen: ChosenImages
-    inter_share: NDArray[np.float32]
-    fast: Bools
-    read_out: float | None
-    digest: str = ""
-
-    def doubted_at(self, frames: Sequence[int]) -> VideoTracks:
-        """A copy in which the motion of some frames is unreliable, as if they were intra-coded."""
-        share = self.inter_share.copy()
-        share[list(frames)] = 0.0
-        return replace(self, inter_share=share)
 
 
 @dataclass(frozen=True)
@@ -228,8 +200,8 @@ def _spread_in(run: Run, tracked: TrackedVideo, candidates: NDArray[np.int32]) -
     candidates = candidates[candidates < tracks.num_frames]
     names = image_names(run.options.match.images.file_name, candidates.tolist())
     every = ChosenImages(names, candidates)
-    fast = fast_frames(tracked.ends)
-    key = key_images_of_video(run, tracks, every, tracked.inter_share, fast)
+    video = TrackedImages(tracked, every, fast_frames(tracked.ends))
+    key = key_images_of_video(run, video.for_matching)
     most = min(run.options.max_images, len(candidates))
     return every.some(spread_images(tracks.subsample_frames(candidates), most, key))
 
