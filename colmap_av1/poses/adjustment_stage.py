@@ -131,8 +131,8 @@ def adjustment_stage(
             few = spread.every_nth(_NTH_WITH_CORNERS).split_to_length(_LENGTH_WITH_CORNERS)
             sets = [(few, _WITH_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
         with run.clock.measure("adjustment"):
-            points = [_triangulated_points(run, registered, *own) for own in sets]
-            check_agreement(sum(len(own.xyz) for own in points), spread.num_tracks)
+            points = [_triangulated_points(run, registered, some, limits) for some, limits in sets]
+            check_agreement(sum(len(part.xyz) for part in points), spread.num_tracks)
             run.progress("adjustment", 0, 1)
             model = replace(registered.model, points=ModelPoints.concatenate(points))
             iterative = len(model.images) >= _ITERATIVE_IMAGES and not is_fast
@@ -146,10 +146,10 @@ def adjustment_stage(
         photos = names[image_set.photos.start :]
         seams = model_seams(trimmed.model, photos, names)
         with run.clock.measure("adjustment"):
-            own = with_own_cameras(run, trimmed.model)
-        kept = adjusted.kept_points[trimmed.kept_points][own.kept_points]
+            final = with_own_cameras(run, trimmed.model)
+        kept = adjusted.kept_points[trimmed.kept_points][final.kept_points]
         is_motion = kept < len(points[0].xyz)
-        result = own.model
+        result = final.model
         write_posed_model(partial / f"adjusted{suffix}.npz", result)
         return AdjustedResult(
             poses=f"adjusted{suffix}.npz",

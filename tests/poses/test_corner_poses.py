@@ -103,9 +103,9 @@ def test_links_join_images_across_a_gap_in_the_tracks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     registered, seen = scene()
-    joint = 4  # the image before it
-    after = registered.frames > joint
-    # All images after the joint are shifted by about 6 px, more than the error of motion tracks.
+    seam = 4  # the image before it
+    after = registered.frames > seam
+    # All images after the seam are shifted by about 6 px, more than the error of motion tracks.
     off = np.column_stack([np.eye(3), [0, 0.07, 0]])
     images = [
         replace(i, cam_from_world=np.column_stack([i.cam_from_world[:, :3], moved]))
@@ -117,9 +117,9 @@ def test_links_join_images_across_a_gap_in_the_tracks(
         )
     ]
     number = np.repeat(np.arange(NUM_POINTS), NUM_IMAGES)
-    later = seen.frame > joint
+    later = seen.frame > seam
     tracks = seen.keep_observations(((number % 2 == 0) & ~later) | ((number % 4 == 1) & later))
-    links = seen.keep_observations((number % 4 == 3) & (np.abs(seen.frame - joint) <= 3))
+    links = seen.keep_observations((number % 4 == 3) & (np.abs(seen.frame - seam) <= 3))
     write_posed_model(tmp_path / "registered.npz", PosedModel(registered.cameras, images))
     options = ReconstructOptions(poses=PoseOptions(refine_intrinsics=False))
     inputs: Any = None  # only used by earlier stages
@@ -138,4 +138,4 @@ def test_links_join_images_across_a_gap_in_the_tracks(
     centres = camera_centres(np.array([found[i.name].cam_from_world for i in registered.images]))
     steps = np.diff(centres, axis=0)
     usual = np.median(steps, axis=0)
-    assert np.linalg.norm(steps[joint] - usual) < 0.05 * np.linalg.norm(usual)
+    assert np.linalg.norm(steps[seam] - usual) < 0.05 * np.linalg.norm(usual)
