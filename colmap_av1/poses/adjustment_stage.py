@@ -70,6 +70,8 @@ class AdjustedResult(PosesResult):
         scale_lost_seams: names of the images before and after each of `Seams.worst_scale_lost`.
         usual_scaled: see `Seams.usual_scaled`.
         seams_warning: see `Seams.disconnected_warning`.
+        assumes_focal_length: whether the adjustment started from a default focal length that the
+            images hardly determine.
         has_long_focal_length: whether the focal length of a camera was refined, and is longer than
             in most videos.
     """
@@ -80,6 +82,7 @@ class AdjustedResult(PosesResult):
     scale_lost_seams: tuple[tuple[str, str], ...]
     usual_scaled: float
     seams_warning: str | None
+    assumes_focal_length: bool
     has_long_focal_length: bool
 
 
@@ -138,8 +141,10 @@ def adjustment_stage(
             iterative = len(model.images) >= _ITERATIVE_IMAGES and not is_fast
             adjusted = adjust_posed(run, model, iterative=iterative)
             is_long = any(map(has_long_focal_length, adjusted.model.cameras.values()))
+            converged = None
             if is_assumed and refine and not is_long:
-                adjusted = _converged(run, adjusted, iterative=iterative)
+                converged = _converged(run, adjusted, iterative=iterative)
+                adjusted = converged or adjusted
             run.progress("adjustment", 1, 1)
             trimmed = without_sparse_images(adjusted.model)
         names = image_set.images.names
@@ -161,6 +166,7 @@ def adjustment_stage(
             usual_scaled=seams.usual_scaled,
             # No warning about a lost scale: the model is split there, see `parts`.
             seams_warning=seams.disconnected_warning,
+            assumes_focal_length=is_assumed and converged is None,
             has_long_focal_length=refine
             and any(map(has_long_focal_length, result.cameras.values())),
         )
@@ -182,8 +188,8 @@ def adjustment_stage(
     )
 
 
-def _converged(run: Run, adjusted: Adjusted, *, iterative: bool) -> Adjusted:
-    """A model adjusted further if it then determines all focal lengths; else the given one."""
+def _converged(run: Run, adjusted: Adjusted, *, iterative: bool) -> Adjusted | None:
+    """A model adjusted further; None if even then it does not determine all focal lengths."""
     further = adjust_posed(
         run,
         adjusted.model,
@@ -193,7 +199,7 @@ def _converged(run: Run, adjusted: Adjusted, *, iterative: bool) -> Adjusted:
         iterative=iterative,
     )
     if max(focal_length_errors(further.model).values()) >= FOCAL_LENGTH_ERROR:
-        return adjusted
+        return None
     return Adjusted(further.model, adjusted.kept_points[further.kept_points])
 
 

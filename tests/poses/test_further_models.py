@@ -139,7 +139,7 @@ def parts_of_second(
         keypoints_per_image=0.0,
     )
     mapped = MappedResult("first.npz", NUM_FIRST, "incremental", ("second.npz",))
-    adjusted = AdjustedResult("first.npz", NUM_FIRST, 0, (), (), (), 0.0, None, False)
+    adjusted = AdjustedResult("first.npz", NUM_FIRST, 0, (), (), (), 0.0, None, False, False)
     estimate = Estimate(
         matches=Kept(matches, "matches", False),
         mapped=Kept(mapped, "mapped", False),

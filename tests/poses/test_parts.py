@@ -199,7 +199,7 @@ def test_a_jump_splits_a_model_only_if_nothing_else_does(
         image.cam_from_world[0, 3] -= 30
     write_posed_model(tmp_path / "adjusted.npz", known)
     seams = (seam(image_set, 11), seam(image_set, 23))
-    result = AdjustedResult("adjusted.npz", 36, 0, (), seams, (), 0.0, None, False)
+    result = AdjustedResult("adjusted.npz", 36, 0, (), seams, (), 0.0, None, False, False)
     mapped = Kept(MappedResult("poses.npz", 36, "incremental", ()), "0", False)
     nothing = Tracks.empty(36, (640, 480))
     inputs: Any = None  # only used by earlier stages
