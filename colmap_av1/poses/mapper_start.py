@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np  # noqa: F401 - before pycolmap: else writing PNG files fails later
 import pycolmap
@@ -12,7 +12,7 @@ import pycolmap
 from colmap_av1.errors import ModelError
 from colmap_av1.geometry.cameras import assumes_focal_length, with_known_focal_lengths
 from colmap_av1.matching.initial_pairs import prepare_start
-from colmap_av1.matching.mapper_limits import FORWARD_MOTION, InitialLimits
+from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS, FORWARD_MOTION, InitialLimits
 from colmap_av1.matching.match_images import ImageMatches
 from colmap_av1.matching.matched_images import MatchedImages
 from colmap_av1.poses.joint_matches import JointMatches
@@ -78,12 +78,21 @@ def choose_mapper_start(
         )
         # The mapper keeps the default intrinsics only if they count as known.
         cameras, fixed_intrinsics = known_cameras, True
-    matched = None
+    matched = start.matched
     # Without depth, there is no good start.
+    if found.depth.is_observable and start.intrinsics_diverge:
+        # Scripts often run the mapper without the options that `match` prints.
+        default = replace(start, limits=DEFAULT_LIMITS, is_certain=start.limits == DEFAULT_LIMITS)
+        with suppress(ModelError):
+            matched = demote_failing_starts(default, names, known_cameras, clock) or matched
     if found.depth.is_observable and (would_diverge or not start.is_tried):
+        printed = replace(start, matched=matched)
         try:
-            matched = demote_failing_starts(
-                start, names, known_cameras, clock, fixed_intrinsics=fixed_intrinsics
+            matched = (
+                demote_failing_starts(
+                    printed, names, known_cameras, clock, fixed_intrinsics=fixed_intrinsics
+                )
+                or matched
             )
         except ModelError:
             warnings.append(
@@ -91,7 +100,7 @@ def choose_mapper_start(
                 "its output tells why"
             )
     return MapperStart(
-        matched=matched or start.matched,
+        matched=matched,
         cameras=cameras,
         limits=start.limits,
         fixed_intrinsics=fixed_intrinsics,
