@@ -612,6 +612,17 @@ def test_mapper_begins_well_where_two_images_hardly_determine_the_intrinsics(
 
 
 @pytest.mark.shared
+def test_links_carry_the_scale_across_a_jerk(shared: Path, tmp_path: Path) -> None:
+    """Motion tracks cross the jerk, but hardly any of them have depth on both sides."""
+    clip = shared / "sequences" / "log_building" / "clip.mp4"
+    options = MatchOptions(images=ImageOptions(num_images=50))
+    report = match(tmp_path / "a.db", clip, image_path=tmp_path / "frames", options=options)
+    assert report.estimate is not None
+    assert report.estimate.num_registered == (50,)
+    assert report.links.num_links > 0
+
+
+@pytest.mark.shared
 def test_drive_with_unknown_intrinsics_is_mapped(street: Street, tmp_path: Path) -> None:
     report = match(tmp_path / "a.db", street(20), image_path=tmp_path / "frames")
     assert report.estimate is not None

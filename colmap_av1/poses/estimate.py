@@ -39,7 +39,7 @@ class _Plan:
     """What an estimate is made from.
 
     Attributes:
-        doubted: frames after doubtful seams, where links replace motion.
+        doubted: frames after seams that are doubtful or lose the scale, where links replace motion.
         links: "sift": look for loop closures in all videos; "none": use no links; None: as in the
             options of the run.
         first: file of the mapper's model to continue with; None for the largest.
@@ -148,8 +148,9 @@ class _Estimates:
 def estimate_poses(run: Run, videos: Sequence[VideoTracks], image_set: ImageSet) -> Estimate:
     """Estimate poses, and if they are doubtful estimate them again with further SIFT links.
 
-    Links replace motion at doubtful seams. Loop closures are looked for if pictures far apart in
-    time contradict the poses. A model that is still poorly connected is split, see `parts`.
+    Links replace motion at seams that are doubtful or lose the scale. Loop closures are looked for
+    if pictures far apart in time contradict the poses. A model that is still poorly connected is
+    split, see `parts`.
 
     Raises:
         ModelError: no poses can be estimated.
@@ -265,18 +266,18 @@ def _with_links(run: Run, links: Literal["sift", "none"]) -> Run:
 
 
 def _unlinked_seams(run: Run, image_set: ImageSet, estimate: Estimate) -> list[int]:
-    """Frames after doubtful seams where no links were looked for."""
+    """Frames after seams that are doubtful or lose the scale, where no links were looked for."""
     if estimate.adjustment is None or run.options.match.links.links == "none":
         return []
     frame_of = image_set.images.frame_of
-    links = estimate.matches.result.links
+    links, adjusted = estimate.matches.result.links, estimate.adjustment.result
     looked_at = [*links.frames_of_gaps(), *links.fast]
     seams = [
         (frame_of[first], frame_of[second])
-        for first, second in estimate.adjustment.result.doubtful_seams
+        for first, second in {*adjusted.doubtful_seams, *adjusted.scale_lost_seams}
     ]
-    return [
+    return sorted(
         after
         for before, after in seams
         if not any(first <= before and after <= last for first, last in looked_at)
-    ]
+    )
