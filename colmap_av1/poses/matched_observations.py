@@ -30,10 +30,11 @@ _SHORT, _REVISITED = 8, 10
 SPANS = (2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 80, 96, 128)
 NUM_OBSERVATIONS = 3
 # Each density preset limits the number of keypoints per image from such tracks to a share of the
-# number of SIFT features of a picture, and to a fixed number. With the default preset, a mapper
-# makes at least 1.2 times as many points as from SIFT in most videos: 100 SIFT features of an image
-# give 3 to 8 points.
-_LIMITS = {"sparse": (0.14, 500), "default": (0.28, 1000)}
+# number of SIFT features of a picture, between two numbers. With the default preset, a mapper makes
+# at least 1.2 times as many points as from SIFT in most videos: 100 SIFT features of an image give
+# 3 to 8 points. With fewer than 300 keypoints, it left half of the images of a dark and noisy video
+# to a second model.
+_LIMITS = {"sparse": (0.14, 150, 500), "default": (0.28, 300, 1000)}
 
 
 def matched_observations(
@@ -81,8 +82,8 @@ def limits_of_density(density: DensityOptions, num_features: Callable[[], float]
     if most is None:
         most = 0
         if density.preset in _LIMITS:
-            share, limit = _LIMITS[density.preset]
-            most = max(1, min(limit, round(share * num_features())))  # 0 would be no limit
+            share, least, limit = _LIMITS[density.preset]
+            most = min(limit, max(least, round(share * num_features())))
     return replace(density, max_tracks_per_image=most, min_images=NUM_OBSERVATIONS)
 
 

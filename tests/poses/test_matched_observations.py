@@ -91,14 +91,14 @@ def test_tracks_with_three_observations_are_limited() -> None:
     assert 100 < np.count_nonzero(counts) <= 200
 
 
-@pytest.mark.parametrize(("preset", "most"), [("sparse", 140), ("default", 280), ("dense", 0)])
-def test_number_of_tracks_depends_on_the_features_of_the_pictures(preset: str, most: int) -> None:
-    limits = limits_of_density(DensityOptions(preset=preset), lambda: 1000.0)
-    assert limits.max_tracks_per_image == most
+@pytest.mark.parametrize(
+    ("preset", "few", "most"), [("sparse", 150, 280), ("default", 300, 560), ("dense", 0, 0)]
+)
+def test_number_of_tracks_depends_on_the_features_of_the_pictures(
+    preset: str, few: int, most: int
+) -> None:
+    for num_features, wanted in ((1.0, few), (2000.0, most)):
+        limits = limits_of_density(DensityOptions(preset=preset), lambda n=num_features: n)
+        assert limits.max_tracks_per_image == wanted
     given = DensityOptions(preset=preset, max_tracks_per_image=77)
-    assert limits_of_density(given, lambda: 1000.0).max_tracks_per_image == 77
-
-
-def test_pictures_without_features_do_not_remove_the_limit() -> None:
-    """A limit of 0 would be none."""
-    assert limits_of_density(DensityOptions(preset="default"), lambda: 1.0).max_tracks_per_image
+    assert limits_of_density(given, lambda: 2000.0).max_tracks_per_image == 77
