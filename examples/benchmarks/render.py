@@ -618,6 +618,21 @@ def walks(rows: list[Row]) -> str:
     return f"{markdown(columns, rows)}\n{measured_at(rows, 'walk', 'way')}"
 
 
+def altered(rows: list[Row]) -> str:
+    """Models of altered clips, see `altered.py`."""
+    columns = [
+        Column("clip", lambda row: f"`{row['clip']}`"),
+        words("alteration", "alteration"),
+        words("way", "way"),
+        Column("images", lambda row: f"{row['registered'] or 0} of {row['images'] or '-'}"),
+        figure("points", "points", ",.0f"),
+        figure("reprojection error", "error_px", ".3f", " px"),
+        figure("error of camera centres", "ate_of_extent", ".2%"),
+        figure("CPU s", "cpu_s", ".1f"),
+    ]
+    return f"{markdown(columns, rows, left=3)}\n{measured_at(rows, 'clip', 'alteration')}"
+
+
 def one_model(rows: list[Row]) -> str:
     """Models of cut, several, fast and long videos."""
 
@@ -716,6 +731,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "phone_to_folder.summary": summary,
     "phone_to_folder.steps": phone_to_folder_steps,
     "phone_to_folder.stages": phone_to_folder_stages,
+    "altered": altered,
     "jerks": jerks,
     "loops": loops,
     "read_motion": read_motion,
