@@ -1,4 +1,4 @@
-"""Measure models of clips that were scaled, cropped, darkened, thinned out or compressed before.
+"""Measure models of clips that were scaled, cropped, darkened or compressed, or lack frames.
 
 python examples/benchmarks/altered.py --cache benchmark_altered
 
