@@ -47,6 +47,7 @@ from colmap_av1.options import (
     DensityOptions,
     ImageOptions,
     LinkOptions,
+    MapOptions,
     MaskOptions,
     MatchOptions,
     PairOptions,
@@ -604,9 +605,9 @@ def test_mapper_begins_well_where_two_images_hardly_determine_the_intrinsics(
     report = match(tmp_path / "a.db", small, image_path=tmp_path / "frames")
     assert report.fixed_intrinsics
     assert report.focal_length is not None
-    options = replace(report.map_options, num_threads=1)
-    refining = replace(options, refine_intrinsics=True)
-    for name, used in (("kept", options), ("refined", refining)):
+    printed = replace(report.map_options, num_threads=1)
+    default = MapOptions(forward_motion=False, num_threads=1)
+    for name, used in (("printed", printed), ("default", default)):
         mapped = map_database(tmp_path / "a.db", tmp_path / "frames", tmp_path / name, options=used)
         assert mapped.num_registered == (report.num_images,)
 
@@ -620,6 +621,7 @@ def test_links_carry_the_scale_across_a_jerk(shared: Path, tmp_path: Path) -> No
     assert report.estimate is not None
     assert report.estimate.num_registered == (50,)
     assert report.links.num_links > 0
+    assert [gap.reasons for gap in report.links.gaps] == [("doubtful motion",)]
 
 
 @pytest.mark.shared

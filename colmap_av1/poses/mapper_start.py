@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np  # noqa: F401 - before pycolmap: else writing PNG files fails later
 import pycolmap
@@ -46,7 +47,8 @@ def choose_mapper_start(
     """Choose pairs, cameras and fixed intrinsics so that the mapper starts a large model.
 
     If the joint estimate does not determine the focal length, the mapper refines the default one if
-    a large model then grows, and otherwise keeps it.
+    a large model then grows, and otherwise keeps it. If intrinsics diverge with many pairs, the
+    pairs are chosen so that a mapper with default options, which refines them, starts well, too.
 
     Args:
         found: the matches and cameras.
@@ -54,12 +56,12 @@ def choose_mapper_start(
         clock: gets the stage "verification".
         keep_cameras: the cameras are those of an existing database, which do not change.
     """
-    joint = found if isinstance(found, JointMatches) else None
-    poses = joint.poses if joint is not None else []
-    # The cameras of images that the joint estimate does not register do not count.
-    is_assumed = assumes_focal_length(
-        joint.registered_cameras if joint is not None else found.cameras
-    )
+    if isinstance(found, JointMatches):
+        # The cameras of images that the joint estimate does not register do not count.
+        poses, counted = found.poses, found.registered_cameras
+    else:
+        poses, counted = [], found.cameras
+    is_assumed = assumes_focal_length(counted)
     # The poses of pairs are wrong if a focal length is assumed.
     start = prepare_start(found.matched, found.cameras, clock, [] if is_assumed else poses)
     cameras, known_cameras = found.cameras, with_known_focal_lengths(found.cameras)
@@ -78,29 +80,26 @@ def choose_mapper_start(
         )
         # The mapper keeps the default intrinsics only if they count as known.
         cameras, fixed_intrinsics = known_cameras, True
-    matched = start.matched
+    matched = None
     # Without depth, there is no good start.
-    if found.depth.is_observable and start.intrinsics_diverge:
-        # Scripts often run the mapper without the options that `match` prints.
-        default = replace(start, limits=DEFAULT_LIMITS, is_certain=start.limits == DEFAULT_LIMITS)
-        with suppress(ModelError):
-            matched = demote_failing_starts(default, names, known_cameras, clock) or matched
     if found.depth.is_observable and (would_diverge or not start.is_tried):
-        printed = replace(start, matched=matched)
+        tried = partial(demote_failing_starts, names=names, cameras=known_cameras, clock=clock)
         try:
-            matched = (
-                demote_failing_starts(
-                    printed, names, known_cameras, clock, fixed_intrinsics=fixed_intrinsics
-                )
-                or matched
-            )
+            if would_diverge:
+                # Scripts often run the mapper without the options that `match` prints.
+                is_certain = start.is_certain and start.limits == DEFAULT_LIMITS
+                plain = tried(replace(start, limits=DEFAULT_LIMITS, is_certain=is_certain))
+                if plain is not None:
+                    matched = tried(replace(start, matched=plain), fixed_intrinsics=True)
+            if matched is None:
+                matched = tried(start, fixed_intrinsics=fixed_intrinsics)
         except ModelError:
             warnings.append(
                 "COLMAP's mapper failed in a trial on this database, and may fail again: if so, "
                 "its output tells why"
             )
     return MapperStart(
-        matched=matched,
+        matched=matched or start.matched,
         cameras=cameras,
         limits=start.limits,
         fixed_intrinsics=fixed_intrinsics,

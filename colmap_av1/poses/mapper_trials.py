@@ -47,7 +47,7 @@ def demote_failing_starts(
 ) -> MatchedImages | None:
     """Limit the inliers of pairs with which COLMAP's incremental mapper starts a small model.
 
-    The mapper runs with one thread and the seed 0, with the options that `match` prints. If no pair
+    The mapper runs with one thread and the seed 0, with the limits of `start`. If no pair
     certainly meets its limits, it begins with lower ones, since it would try all pairs before it
     lowers them. Other seeds, numbers of threads and versions often start alike.
 
