@@ -158,9 +158,10 @@ def measure(clip: Clip, alteration: str, way: str, folder: Path) -> Row:
     try:
         done = run_measured(run, clip.video, output, log=folder / "log")
     except ColmapAv1Error as error:
-        return replace(row, warnings=str(error))
+        return replace(row, warnings=str(error).replace(f"{folder}/", ""))
     num_images, warnings = done.result
-    row = replace(row, cpu_s=done.cpu_seconds, images=num_images, warnings="; ".join(warnings))
+    words = "; ".join(warnings).replace(f"{folder}/", "")
+    row = replace(row, cpu_s=done.cpu_seconds, images=num_images, warnings=words)
     if not (output / model).is_dir():
         return row
     return replace(row, **figures_of(clip, output / model, None, num_images))
