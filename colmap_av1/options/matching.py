@@ -64,9 +64,9 @@ class LinkOptions(Options):
 
     links: Literal["auto", "none", "sift"] = option(
         "auto",
-        "auto: match SIFT features across gaps in the motion, where the camera moves fast, and, in "
-        "videos much longer than tracks reach, at loop closures; sift: look for loop closures in "
-        "any video; none: use motion alone",
+        "auto: match SIFT features across gaps in the motion, where the camera moves fast or few "
+        "points join the images, and, in videos much longer than tracks reach, at loop closures; "
+        "sift: look for loop closures in any video; none: use motion alone",
         common=True,
     )
     max_link_features: int = option(1500, "largest number of features of a picture", least=50)

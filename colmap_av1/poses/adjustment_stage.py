@@ -70,8 +70,8 @@ class AdjustedResult(PosesResult):
         scale_lost_seams: names of the images before and after each of `Seams.worst_scale_lost`.
         usual_scaled: see `Seams.usual_scaled`.
         seams_warning: see `Seams.disconnected_warning`.
-        assumes_focal_length: whether the adjustment started from a default focal length that the
-            images hardly determine.
+        keeps_assumed_focal_length: whether the adjustment started from a default focal length, and
+            the images hardly determine another.
         has_long_focal_length: whether the focal length of a camera was refined, and is longer than
             in most videos.
     """
@@ -82,7 +82,7 @@ class AdjustedResult(PosesResult):
     scale_lost_seams: tuple[tuple[str, str], ...]
     usual_scaled: float
     seams_warning: str | None
-    assumes_focal_length: bool
+    keeps_assumed_focal_length: bool
     has_long_focal_length: bool
 
 
@@ -166,7 +166,7 @@ def adjustment_stage(
             usual_scaled=seams.usual_scaled,
             # No warning about a lost scale: the model is split there, see `parts`.
             seams_warning=seams.disconnected_warning,
-            assumes_focal_length=is_assumed and converged is None,
+            keeps_assumed_focal_length=is_assumed and converged is None,
             has_long_focal_length=refine
             and any(map(has_long_focal_length, result.cameras.values())),
         )

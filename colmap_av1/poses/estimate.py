@@ -39,7 +39,7 @@ class _Plan:
     """What an estimate is made from.
 
     Attributes:
-        doubted: frames after seams that are doubtful or lose the scale, where links replace motion.
+        doubted: frames after seams where links replace motion.
         links: "sift": look for loop closures in all videos; "none": use no links; None: as in the
             options of the run.
         first: file of the mapper's model to continue with; None for the largest.

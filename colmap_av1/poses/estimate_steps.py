@@ -234,7 +234,7 @@ def _is_doubtful(estimate: Estimate) -> bool:
         return False
     matches, adjusted = estimate.matches.result, estimate.adjustment.result
     uncertain = (
-        adjusted.doubtful_seams or adjusted.scale_lost_seams or adjusted.assumes_focal_length
+        adjusted.doubtful_seams or adjusted.scale_lost_seams or adjusted.keeps_assumed_focal_length
     )
     may_bend = (matches.links.gaps or matches.links.fast) and uncertain
     return bool(adjusted.has_long_focal_length or may_bend)

@@ -45,7 +45,7 @@ class LongRangeResult:
     contradicts_poses: bool
 
 
-# In place of the result for models that are not checked.
+# The result for models that are not checked.
 NOT_CHECKED = Kept(
     LongRangeResult(median=None, largest=None, warning=None, contradicts_poses=False),
     digest="",

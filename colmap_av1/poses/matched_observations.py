@@ -32,8 +32,8 @@ NUM_OBSERVATIONS = 3
 # Each density preset limits the number of keypoints per image from such tracks to a share of the
 # number of SIFT features of a picture, between two numbers. With the default preset, a mapper makes
 # at least 1.2 times as many points as from SIFT in most videos: 100 SIFT features of an image give
-# 3 to 8 points. With fewer than 300 keypoints, it left half of the images of a dark and noisy video
-# to a second model.
+# 3 to 8 points. With fewer than 300 such keypoints per image, the mapper divided a dark and noisy
+# video into two models.
 _LIMITS = {"sparse": (0.14, 150, 500), "default": (0.28, 300, 1000)}
 
 

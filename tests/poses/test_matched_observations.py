@@ -92,13 +92,14 @@ def test_tracks_with_three_observations_are_limited() -> None:
 
 
 @pytest.mark.parametrize(
-    ("preset", "few", "most"), [("sparse", 150, 280), ("default", 300, 560), ("dense", 0, 0)]
+    ("preset", "limits"),
+    [("sparse", (150, 280, 500)), ("default", (300, 560, 1000)), ("dense", (0, 0, 0))],
 )
 def test_number_of_tracks_depends_on_the_features_of_the_pictures(
-    preset: str, few: int, most: int
+    preset: str, limits: tuple[int, ...]
 ) -> None:
-    for num_features, wanted in ((1.0, few), (2000.0, most)):
-        limits = limits_of_density(DensityOptions(preset=preset), lambda n=num_features: n)
-        assert limits.max_tracks_per_image == wanted
+    for num_features, most in zip((1.0, 2000.0, 10000.0), limits, strict=True):
+        found = limits_of_density(DensityOptions(preset=preset), lambda n=num_features: n)
+        assert found.max_tracks_per_image == most
     given = DensityOptions(preset=preset, max_tracks_per_image=77)
     assert limits_of_density(given, lambda: 2000.0).max_tracks_per_image == 77
