@@ -47,9 +47,9 @@ def demote_failing_starts(
 ) -> MatchedImages | None:
     """Limit the inliers of pairs with which COLMAP's incremental mapper starts a small model.
 
-    The mapper runs with one thread and the seed 0, with the limits of `start`. If no pair
-    certainly meets its limits, it begins with lower ones, since it would try all pairs before it
-    lowers them. Other seeds, numbers of threads and versions often start alike.
+    The mapper runs with one thread and the seed 0, with the limits of `start`. If no pair certainly
+    meets them, it begins with lower ones, since it would try all pairs before it lowers them. Other
+    seeds, numbers of threads and versions often start alike.
 
     Args:
         start: the images, and the mapper's limits.

@@ -10,7 +10,6 @@ given. Model 0 is measured, because it is the one that users open.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import sys
 from dataclasses import asdict, dataclass, replace
@@ -21,7 +20,7 @@ import numpy as np  # noqa: F401 - before pycolmap: the other order breaks writi
 import render
 from mapping import map_incrementally
 from phone_to_folder import Clip, clip_of, figures_of
-from results import add_results, read_rows, save
+from results import add_results, clips_parser, read_rows, save
 from rich.console import Console
 
 from colmap_av1 import (
@@ -37,7 +36,6 @@ from colmap_av1.util.digests import file_digest
 from colmap_av1.util.stages import run_stage_in
 
 IMAGES = ImageOptions(num_images=50)
-WAYS = (render.FROM_FILE, render.MATCH_PYCOLMAP)
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class Alteration:
     Attributes:
         filters: ffmpeg's video filters.
         crf: constant rate factor of the H.264 encoder.
-        step: step between the frames that the filters keep.
+        step: number of frames of which one is kept.
     """
 
     filters: str = "null"
@@ -63,7 +61,7 @@ ALTERATIONS = {
     "dark, noise": Alteration(
         "lutyuv=y=16+0.3*(val-16):u=128+0.3*(val-128):v=128+0.3*(val-128),noise=alls=6:allf=t"
     ),
-    "every second frame": Alteration("framestep=2", step=2),
+    "every second frame": Alteration(step=2),
     "crf 36": Alteration(crf=36),
 }
 
@@ -75,7 +73,7 @@ class Row:
     Attributes:
         clip: name of the clip.
         alteration: one of `ALTERATIONS`.
-        way: one of `WAYS`.
+        way: one of `RUNS`.
         cpu_s: CPU time from the file to the model.
         images: number of images.
         registered: number of registered images.
@@ -101,17 +99,8 @@ class Row:
 
 def main() -> int:
     """Measure every clip with every alteration, and save and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--cache", type=Path, required=True, help="folder for clips and models")
-    parser.add_argument(
-        "--clips",
-        nargs="+",
-        default=["log_building", "ditch", "holiday_display", "shelfbox", "kitchen"],
-        metavar="NAME",
-        help="sequences of ../shared",
-    )
+    clips = ["log_building", "ditch", "holiday_display", "shelfbox", "kitchen"]
+    parser = clips_parser(__doc__, clips, "sequences of ../shared")
     parser.add_argument("--alterations", nargs="+", choices=ALTERATIONS, default=[*ALTERATIONS])
     add_results(parser, "altered")
     arguments = parser.parse_args()
@@ -123,7 +112,7 @@ def main() -> int:
             console.print(f"{name}: {alteration}", markup=False)
             own = folder / alteration.replace(", ", " ").replace(" ", "_")
             clip = altered(original, ALTERATIONS[alteration], own / "video")
-            for way in WAYS:
+            for way in RUNS:
                 row = measure(clip, alteration, way, own)
                 save(arguments.results, [asdict(row)], ("clip", "alteration", "way"))
     print(render.altered(read_rows(arguments.results)), end="")
@@ -135,7 +124,8 @@ def altered(clip: Clip, alteration: Alteration | None, folder: Path) -> Clip:
     if alteration is None:
         return clip
     video = folder / "video.mp4"
-    words = ("-vf", alteration.filters, "-c:v", "libx264", "-crf", str(alteration.crf))
+    filters = f"{alteration.filters},framestep={alteration.step}"
+    words = ("-vf", filters, "-c:v", "libx264", "-crf", str(alteration.crf))
 
     def make() -> None:
         ruler.ffmpeg("-i", str(clip.video), *words, "-pix_fmt", "yuv420p", str(video))
@@ -149,10 +139,8 @@ def altered(clip: Clip, alteration: Alteration | None, folder: Path) -> Clip:
 def measure(clip: Clip, alteration: str, way: str, folder: Path) -> Row:
     """Make the models of a clip in a folder by one way, and measure the first."""
     row = Row(clip.name, alteration, way)
-    run, output, model = {
-        render.FROM_FILE: (run_reconstruct, folder / "reconstruct", "sparse/0"),
-        render.MATCH_PYCOLMAP: (run_match, folder / "match", "models/0"),
-    }[way]
+    run, model = RUNS[way]
+    output = folder / run.__name__
     shutil.rmtree(output, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -183,6 +171,12 @@ def run_match(video: Path, output: Path) -> tuple[int, tuple[str, ...]]:
     map_incrementally(database, images, output / "models", report.next_commands[0])
     return report.num_images, report.warnings
 
+
+# How each way makes models, and where it writes the first.
+RUNS = {
+    render.FROM_FILE: (run_reconstruct, "sparse/0"),
+    render.MATCH_PYCOLMAP: (run_match, "models/0"),
+}
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -13,7 +13,6 @@ Every step runs in a separate process. Results stay in the cache: an interrupted
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import shutil
@@ -29,7 +28,7 @@ import phone_clip
 import pycolmap
 import render
 from mapping import map_incrementally
-from results import add_results, read_rows, save
+from results import add_results, clips_parser, read_rows, save
 from rich.console import Console
 from sequences import model_poses, read_sequence
 
@@ -111,17 +110,9 @@ IMAGES = {"kitchen": ImageOptions(every=2), "kitchen_long": ImageOptions(num_ima
 
 def main() -> int:
     """Measure all ways on every clip, and save and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--cache", type=Path, required=True, help="folder for clips and results")
-    parser.add_argument(
-        "--clips",
-        nargs="+",
-        default=["log_building", "ditch", "holiday_display", "street", "phone_10s"],
-        metavar="NAME",
-        help="sequences of ../shared, or phone_10s for a rendered clip of 10 seconds",
-    )
+    clips = ["log_building", "ditch", "holiday_display", "street", "phone_10s"]
+    accepted = "sequences of ../shared, or phone_10s for a rendered clip of 10 seconds"
+    parser = clips_parser(__doc__, clips, accepted)
     parser.add_argument(
         "--ours", action="store_true", help="measure only this package, and keep the rows of SIFT"
     )

@@ -19,6 +19,24 @@ RESULTS = Path(__file__).resolve().parent / "results"
 Value = str | float | int | None
 
 
+def clips_parser(
+    description: str | None, clips: Sequence[str], accepted: str
+) -> argparse.ArgumentParser:
+    """A parser with the options of scripts that measure clips.
+
+    Args:
+        description: the docstring of the script.
+        clips: names of the clips that are measured by default.
+        accepted: which names are accepted, for the help.
+    """
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cache", type=Path, required=True, help="folder for clips and results")
+    parser.add_argument("--clips", nargs="+", default=clips, metavar="NAME", help=accepted)
+    return parser
+
+
 def add_results(parser: argparse.ArgumentParser, name: str) -> None:
     """Add the option for the CSV file of a script."""
     parser.add_argument(

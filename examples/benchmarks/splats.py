@@ -15,7 +15,6 @@ are those of training only.
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import subprocess
@@ -32,7 +31,7 @@ import phone_to_folder
 import pycolmap
 import render
 from phone_to_folder import Clip
-from results import Value, add_results, read_rows, save
+from results import Value, add_results, clips_parser, read_rows, save
 from rich.console import Console
 
 import colmap_av1
@@ -57,17 +56,8 @@ FIGURES = {"iter": "iterations", "cpu_s": "cpu_s", "gaussians": "gaussians"} | {
 
 def main() -> int:
     """Train on every clip in all ways, and save and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--cache", type=Path, required=True, help="folder for clips and results")
-    parser.add_argument(
-        "--clips",
-        nargs="+",
-        default=["log_building", "ditch", "holiday_display", "kitchen", "street"],
-        metavar="NAME",
-        help="sequences of ../shared",
-    )
+    clips = ["log_building", "ditch", "holiday_display", "kitchen", "street"]
+    parser = clips_parser(__doc__, clips, "sequences of ../shared")
     parser.add_argument("--ways", nargs="+", choices=list(render.SPLAT_WAYS), metavar="WAY")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N")
     add_results(parser, "splats")
