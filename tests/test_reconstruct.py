@@ -23,7 +23,7 @@ import imageio_ffmpeg
 import numpy as np
 import pycolmap
 import pytest
-from conftest import Encode, make_frames
+from conftest import Encode, Ffmpeg, make_frames
 from dense_scene import EVERY, NUM_IMAGES, OPTIONS, SCENE, Truth
 from sequences import model_poses
 from trainers import TRAINERS, Taken, brush
@@ -666,3 +666,16 @@ def test_commands_print_their_results_and_write_gaussians(
     assert "max_points" in capsys.readouterr().err
     assert main(words) == 2
     assert "error: " in capsys.readouterr().err
+
+
+@pytest.mark.shared
+def test_short_clip_with_little_parallax_has_plausible_intrinsics(
+    shared: Path, ffmpeg: Ffmpeg, tmp_path: Path
+) -> None:
+    """If the mapper refines the focal length here, it diverges to a seventh of the true one."""
+    cut = "trim=start_frame=31:end_frame=51,setpts=PTS-STARTPTS"
+    clip = shared / "sequences" / "cafe" / "clip.mp4"
+    short = ffmpeg("-i", clip, "-vf", cut, "-c:v", "libx264", "-crf", "17", tmp_path / "short.mp4")
+    report = reconstruct(short, tmp_path / "out")
+    assert report.num_registered == report.num_images == 20
+    assert not any("focal length" in warning for warning in report.warnings)

@@ -14,7 +14,12 @@ from colmap_av1.check.contents import Images, Pairs
 from colmap_av1.check.parallax import Parallax
 from colmap_av1.database.layout import columns
 from colmap_av1.errors import ImageError
-from colmap_av1.geometry.cameras import camera_fault, focal_length_warning
+from colmap_av1.geometry.cameras import (
+    MAPPER_FOCAL_RATIOS,
+    MAPPER_MAX_DISTORTION,
+    camera_fault,
+    focal_length_warning,
+)
 from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.few_matches import few_matches_warning
 from colmap_av1.matching.gaps import Gap
@@ -33,10 +38,6 @@ Severity = Literal["error", "warning", "note"]
 
 # A smaller share of keypoints without a match is not reported.
 _NOTED_SHARE = 0.01
-# COLMAP's mappers ignore images whose camera is outside these limits: focal length in units of the
-# longer image side, and absolute value of each distortion parameter.
-_FOCAL_RATIOS = (0.1, 10.0)
-_LARGEST_DISTORTION = 1.0
 # Keypoints up to this many pixels outside their image are accepted, because of rounding.
 _MARGIN = 1.0
 
@@ -139,7 +140,7 @@ def _camera_findings(cameras: dict[int, pycolmap.Camera]) -> Iterator[Finding]:
     implausible = [
         str(i)
         for i, camera in cameras.items()
-        if not faults[i] and camera.has_bogus_params(*_FOCAL_RATIOS, _LARGEST_DISTORTION)
+        if not faults[i] and camera.has_bogus_params(*MAPPER_FOCAL_RATIOS, MAPPER_MAX_DISTORTION)
     ]
     if implausible:
         yield Finding(

@@ -19,6 +19,10 @@ from colmap_av1.options.camera import (
     parse_camera_params,
 )
 
+# COLMAP's mappers ignore images whose camera is outside these limits: focal length in units of the
+# longer image side, and absolute value of each distortion parameter.
+MAPPER_FOCAL_RATIOS = (0.1, 10.0)
+MAPPER_MAX_DISTORTION = 1.0
 # Models without distortion, and all models that a pinhole camera can initialize.
 _UNDISTORTED = ("SIMPLE_PINHOLE", "PINHOLE")
 _RECTILINEAR = (*_UNDISTORTED, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -120,6 +124,16 @@ def focal_length_warning(cameras: Iterable[pycolmap.Camera]) -> str | None:
                 f"of {camera.width}x{camera.height}: give --camera_model and --camera_params"
             )
     return None
+
+
+def has_implausible_intrinsics(camera: pycolmap.Camera) -> bool:
+    """Whether intrinsics are a sign that their refinement diverged.
+
+    The focal length is as in `focal_length_warning`, or a distortion parameter exceeds the limit of
+    COLMAP's mappers.
+    """
+    shortest = MAPPER_FOCAL_RATIOS[0] if is_fisheye(camera.model_name) else _SHORTEST
+    return camera.has_bogus_params(shortest, _LONGEST, MAPPER_MAX_DISTORTION)
 
 
 def off_centre_warning(camera: pycolmap.Camera) -> str | None:

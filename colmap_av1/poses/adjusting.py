@@ -5,14 +5,15 @@ from __future__ import annotations
 import copy
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from colmap_av1.geometry.colmap_model import posed_images, read_model, write_model
+from colmap_av1.geometry.cameras import has_implausible_intrinsics
+from colmap_av1.geometry.colmap_model import ModelImage, posed_images, read_model, write_model
 from colmap_av1.geometry.model_points import ModelPoints
 from colmap_av1.geometry.posed_model import PosedModel, reprojection_errors
 from colmap_av1.options import ReconstructOptions
@@ -71,6 +72,12 @@ class Adjusted:
     kept_points: Ints
 
 
+def have_diverged(cameras: Mapping[int, pycolmap.Camera], images: Sequence[ModelImage]) -> bool:
+    """Whether most images have a camera whose intrinsics are implausible."""
+    diverged = [has_implausible_intrinsics(cameras[image.camera_id]) for image in images]
+    return sum(diverged) > len(diverged) / 2
+
+
 def adjust_posed(
     run: Run,
     model: PosedModel,
@@ -83,7 +90,9 @@ def adjust_posed(
 ) -> Adjusted:
     """Bundle-adjust a model with the options of the run, see `adjust_model`.
 
-    If there are many observations, the adjustment uses a selection, see `used_observations`.
+    If there are many observations, the adjustment uses a selection, see `used_observations`. If
+    the intrinsics of most images diverge, because the images do not determine them, those of
+    `model` are kept.
 
     Args:
         run: the run.
@@ -103,21 +112,28 @@ def adjust_posed(
     """
     used = used_observations(model.points, len(model.images), OBSERVATIONS)
     points, chosen = model.points.keep_observations(used)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        write_model(folder, model.cameras, model.images, points)
-        adjust_model(
-            folder,
-            refine_intrinsics=refines_intrinsics(run.options),
-            loss_scales=loss_scales,
-            seed=run.context.seed,
-            num_threads=run.options.poses.mapper_threads,
-            log=run.stages / log,
-            max_steps=max_steps,
-            tolerance=tolerance,
-            iterative=iterative,
-        )
-        found = read_model(folder)
+
+    def adjust(*, refine_intrinsics: bool) -> pycolmap.Reconstruction:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            write_model(folder, model.cameras, model.images, points)
+            adjust_model(
+                folder,
+                refine_intrinsics=refine_intrinsics,
+                loss_scales=loss_scales,
+                seed=run.context.seed,
+                num_threads=run.options.poses.mapper_threads,
+                log=run.stages / log,
+                max_steps=max_steps,
+                tolerance=tolerance,
+                iterative=iterative,
+            )
+            return read_model(folder)
+
+    found = adjust(refine_intrinsics=refines_intrinsics(run.options))
+    was_plausible = not have_diverged(model.cameras, model.images)
+    if was_plausible and have_diverged(dict(found.cameras), model.images):
+        found = adjust(refine_intrinsics=False)
     images = posed_images(found)
     # COLMAP drops observations behind their camera, and then points with fewer than two. The ids
     # of points start at 1.

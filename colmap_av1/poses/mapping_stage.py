@@ -20,7 +20,7 @@ from colmap_av1.geometry.posed_model import (
 )
 from colmap_av1.images.image_set import ImageSet
 from colmap_av1.options import CameraOptions, MapOptions
-from colmap_av1.poses.adjusting import refines_intrinsics
+from colmap_av1.poses.adjusting import have_diverged, refines_intrinsics
 from colmap_av1.poses.longest_tracks import keep_longest_tracks
 from colmap_av1.poses.mapper import LEAST_IMAGES, MapperEffort, map_poses
 from colmap_av1.poses.match_stage import MatchesResult
@@ -78,6 +78,9 @@ def mapping_stage(
         )
         for mapper in mappers
     ]
+    if refines_intrinsics(options) and mappers[-1] == "incremental":
+        # With little parallax, the mapper's intrinsics may diverge. The adjustment refines them.
+        attempts.append(replace(attempts[-1], refine_intrinsics=False))
 
     def make(partial: Path) -> MappedResult:
         with clock.measure("poses"):
@@ -93,7 +96,7 @@ def mapping_stage(
                     if attempt is attempts[-1]:
                         raise
                     continue
-                if found:
+                if found and not have_diverged(found[0].cameras, found[0].images):
                     break
         if not found:
             camera = options.match.camera

@@ -18,8 +18,6 @@ from colmap_av1.poses.run import Run
 _FEWEST_IMAGES, _COST_SHARE = 8, 0.998
 # The focal length changes by up to a fifth then, and converges slowly.
 _STEPS, _TOLERANCE = 50, 1e-5
-# A larger parameter has diverged: COLMAP's mapper filters the images of such a camera.
-_MAX_DISTORTION = 1.0
 
 
 def with_second_distortion(run: Run, model: PosedModel) -> PosedModel:
@@ -60,11 +58,5 @@ def with_second_distortion(run: Run, model: PosedModel) -> PosedModel:
     simple = adjusted(model)
     cameras = {i: as_radial(own) if i in numbers else own for i, own in simple.cameras.items()}
     radial = adjusted(replace(simple, cameras=cameras))
-    distortion = [
-        abs(radial.cameras[i].params[j])
-        for i in numbers
-        for j in radial.cameras[i].extra_params_idxs()
-    ]
     simple_cost, radial_cost = (mean_cost(reprojection_errors(own)) for own in (simple, radial))
-    is_better = radial_cost < _COST_SHARE * simple_cost
-    return radial if is_better and max(distortion) <= _MAX_DISTORTION else model
+    return radial if radial_cost < _COST_SHARE * simple_cost else model

@@ -151,6 +151,21 @@ def test_second_distortion_parameter_is_added_if_the_lens_needs_it(
         assert found is model
 
 
+@pytest.mark.parametrize(
+    ("lens", "is_kept"),
+    [([400, 320, 240, 0.1], False), ([400, 320, 240, 1.5], True), ([150, 320, 240, 0.0], True)],
+)
+def test_intrinsics_that_diverge_are_kept(lens: list[float], is_kept: bool, tmp_path: Path) -> None:
+    camera = pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=640, height=480, params=lens)
+    assumed = pycolmap.Camera({**camera.todict(), "params": [1.4 * lens[0], 320, 240, 0.0]})
+    model = replace(posed_scene(camera, 6.0), cameras={1: assumed})
+    run = SimpleNamespace(options=ReconstructOptions(), stages=tmp_path, context=RunContext())
+    adjusted = adjust_posed(run, model).model
+    expected = assumed.params if is_kept else lens
+    assert adjusted.cameras[1].params == pytest.approx(expected, rel=0.05)
+    assert len(adjusted.images) == len(model.images)
+
+
 def test_adjustment_recovers_poses_from_half_of_the_observations(
     made: ReconstructReport, truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
