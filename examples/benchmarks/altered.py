@@ -1,4 +1,4 @@
-"""Measure models of clips that were scaled, cropped, darkened or compressed, or lack frames.
+"""Measure models of clips that were scaled, cropped, darkened, compressed or shortened.
 
 python examples/benchmarks/altered.py --cache benchmark_altered
 
@@ -45,11 +45,15 @@ class Alteration:
     Attributes:
         filters: ffmpeg's video filters.
         crf: constant rate factor of the H.264 encoder.
+        first: number of the first frame that is kept.
+        stop: number of the frame after the last one; None: up to the end.
         step: number of frames of which one is kept.
     """
 
     filters: str = "null"
     crf: int = 18
+    first: int = 0
+    stop: int | None = None
     step: int = 1
 
 
@@ -62,6 +66,7 @@ ALTERATIONS = {
         "lutyuv=y=16+0.3*(val-16):u=128+0.3*(val-128):v=128+0.3*(val-128),noise=alls=6:allf=t"
     ),
     "every second frame": Alteration(step=2),
+    "20 frames": Alteration(first=20, stop=40),
     "crf 36": Alteration(crf=36),
 }
 
@@ -124,7 +129,10 @@ def altered(clip: Clip, alteration: Alteration | None, folder: Path) -> Clip:
     if alteration is None:
         return clip
     video = folder / "video.mp4"
-    filters = f"{alteration.filters},framestep={alteration.step}"
+    first, stop, step = alteration.first, alteration.stop, alteration.step
+    end = "" if stop is None else f":end_frame={stop}"
+    trim = f"trim=start_frame={first}{end},setpts=PTS-STARTPTS"
+    filters = f"{trim},framestep={step},{alteration.filters}"
     words = ("-vf", filters, "-c:v", "libx264", "-crf", str(alteration.crf))
 
     def make() -> None:
@@ -132,7 +140,7 @@ def altered(clip: Clip, alteration: Alteration | None, folder: Path) -> Clip:
 
     given = [file_digest(clip.video), words]
     run_stage_in(folder, given, None, make, products=[video], made_by=())
-    poses = None if clip.poses is None else clip.poses[:: alteration.step]
+    poses = None if clip.poses is None else clip.poses[first:stop:step]
     return replace(clip, video=video, poses=poses)
 
 
