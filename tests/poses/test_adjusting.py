@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -13,22 +14,35 @@ import pytest
 from dense_scene import OPTIONS, Truth
 from hypothesis import given
 from hypothesis import strategies as st
+from image_sets import images, tracks_from
 from scipy.spatial.transform import Rotation
 
 from colmap_av1 import CameraOptions, MatchOptions, ReconstructOptions
 from colmap_av1.evaluate.metrics.poses import pose_errors
 from colmap_av1.geometry.colmap_model import ModelImage, read_model
 from colmap_av1.geometry.model_points import ModelPoints
-from colmap_av1.geometry.posed_model import PosedModel, posed_model, reprojection_errors
+from colmap_av1.geometry.posed_model import (
+    PosedModel,
+    posed_model,
+    read_posed_model,
+    reprojection_errors,
+    write_posed_model,
+)
+from colmap_av1.geometry.track_points import tracks_of_points
 from colmap_av1.poses import adjusting
 from colmap_av1.poses.adjusting import (
     adjust_posed,
     focal_length_errors,
     used_observations,
 )
+from colmap_av1.poses.adjustment_stage import adjustment_stage
+from colmap_av1.poses.estimate_tracks import EstimateTracks
+from colmap_av1.poses.posed_images import PosesResult
+from colmap_av1.poses.run import Run
 from colmap_av1.poses.second_distortion import with_second_distortion
 from colmap_av1.reconstruct import ReconstructReport
 from colmap_av1.util.run_context import RunContext
+from colmap_av1.util.stages import Kept
 
 
 def points_seen_in(views: list[list[int]]) -> ModelPoints:
@@ -115,6 +129,39 @@ def test_focal_length_is_observable_with_turns_but_not_on_a_straight_path() -> N
     assert errors[6.0] < 0.005
     # Infinite in exact arithmetic; rounding may make it finite.
     assert errors[0.0] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("turn", "is_assumed", "is_kept"), [(2.0, True, False), (0.0, True, True), (0.0, False, False)]
+)
+def test_assumed_focal_length_is_kept_if_the_images_do_not_determine_another(
+    turn: float, is_assumed: bool, is_kept: bool, tmp_path: Path
+) -> None:
+    """They do if the camera turns. A focal length that was not assumed cannot stay assumed."""
+    lens, assumed = (
+        pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal_length, 640, 480)
+        for focal_length in (500.0, 576.0)
+    )
+    exact, image_set = posed_scene(lens, turn), images(12)
+    frames = np.arange(12, dtype=np.int32)
+    motion = tracks_of_points(exact.points, frames, 12, (640, 480))
+    posed = [
+        replace(image, name=name)
+        for image, name in zip(exact.images, image_set.images.names, strict=True)
+    ]
+    write_posed_model(tmp_path / "poses.npz", PosedModel({1: assumed}, posed))
+    inputs: Any = None  # only used by other stages
+    adjusted = adjustment_stage(
+        Run(inputs, (), (), tmp_path, tmp_path, ReconstructOptions(), RunContext()),
+        EstimateTracks(motion, tracks_from([], 12), has_picture_positions=False),
+        image_set,
+        Kept(PosesResult("poses.npz", 12), digest="", resumed=False),
+        is_assumed=is_assumed,
+    ).result
+    assert adjusted.keeps_assumed_focal_length == is_kept
+    if turn:
+        found = read_posed_model(tmp_path / adjusted.poses)
+        assert found.cameras[1].focal_length == pytest.approx(500, rel=0.005)
 
 
 @pytest.mark.parametrize(
