@@ -178,7 +178,7 @@ def _first_estimate(estimates: _Estimates) -> _FirstEstimate:
     """Make the first estimate, and see where further links are needed."""
     run, estimate = estimates.run, estimates.whole(_FIRST_PLAN)
     further = _Plan(
-        doubted=tuple(_unlinked_seams(run, estimates.image_set, estimate)),
+        doubted=tuple(unlinked_seams(run, estimates.image_set, estimate)),
         links="sift" if _needs_loops(run, estimate) else None,
     )
     return _FirstEstimate(further, not estimate.is_contradicted or bool(estimate.seams_to_split))
@@ -265,7 +265,7 @@ def _with_links(run: Run, links: Literal["sift", "none"]) -> Run:
     return replace(run, options=replace(run.options, match=match))
 
 
-def _unlinked_seams(run: Run, image_set: ImageSet, estimate: Estimate) -> list[int]:
+def unlinked_seams(run: Run, image_set: ImageSet, estimate: Estimate) -> list[int]:
     """Frames after seams that are doubtful or lose the scale, where no links were looked for."""
     if estimate.adjustment is None or run.options.match.links.links == "none":
         return []

@@ -80,6 +80,23 @@ class Estimate:
         return self.long_range.result.median is not None and not self.is_contradicted
 
     @property
+    def is_doubtful(self) -> bool:
+        """Whether the focal length may be wrong, or the model may bend where links replace motion.
+
+        It may bend if points connect it poorly somewhere, or if its focal length is still assumed.
+        """
+        if self.adjustment is None:
+            return False
+        links, adjusted = self.matches.result.links, self.adjustment.result
+        is_uncertain = bool(
+            adjusted.doubtful_seams
+            or adjusted.scale_lost_seams
+            or adjusted.keeps_assumed_focal_length
+        )
+        may_bend = bool(links.gaps or links.fast) and is_uncertain
+        return adjusted.has_long_focal_length or may_bend
+
+    @property
     def seams_to_split(self) -> list[tuple[str, str]]:
         """Names of the images before and after each seam to split the model at."""
         if self.adjustment is None:
@@ -158,7 +175,7 @@ def pose_images(
         has_picture_positions=not any(own.read_out for own in videos),
     )
     estimate = refined_poses(run, estimate, image_set, found.keyed)
-    if _is_doubtful(estimate):
+    if estimate.is_doubtful:
         estimate = remapped_poses(run, estimate, image_set, least_kept=_LEAST_KEPT)
     return _long_range_check(run, estimate, image_set)
 
@@ -223,21 +240,6 @@ def _adjusted(
         number=number,
     )
     return replace(estimate, adjustment=adjustment)
-
-
-def _is_doubtful(estimate: Estimate) -> bool:
-    """Whether the adjusted model may have a wrong focal length, or bend where links replace motion.
-
-    It may bend if points connect it poorly somewhere, or if its focal length is still assumed.
-    """
-    if estimate.adjustment is None:
-        return False
-    matches, adjusted = estimate.matches.result, estimate.adjustment.result
-    uncertain = (
-        adjusted.doubtful_seams or adjusted.scale_lost_seams or adjusted.keeps_assumed_focal_length
-    )
-    may_bend = (matches.links.gaps or matches.links.fast) and uncertain
-    return bool(adjusted.has_long_focal_length or may_bend)
 
 
 def remapped_poses(

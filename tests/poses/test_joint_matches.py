@@ -182,7 +182,7 @@ def test_links_that_images_contradict_are_not_used(
     is_wrong: bool,
 ) -> None:
     """Links at a doubtful seam replace motion unless images contradict only poses with them."""
-    monkeypatch.setattr(estimate, "_unlinked_seams", lambda run, image_set, posed: [30])
+    monkeypatch.setattr(estimate, "unlinked_seams", lambda run, image_set, posed: [30])
     is_contradicted = property(lambda own: is_wrong and bool(own.matches.result.links.gaps))
     monkeypatch.setattr(Estimate, "is_contradicted", is_contradicted)
     report = match(tmp_path / "a.db", scene, image_path=joint.image_path, options=OPTIONS)
@@ -200,7 +200,7 @@ def test_links_are_left_out_if_images_agree_only_with_poses_without_them(
     monkeypatch: pytest.MonkeyPatch,
     is_right: bool,
 ) -> None:
-    monkeypatch.setattr(estimate, "_unlinked_seams", lambda run, image_set, posed: [30])
+    monkeypatch.setattr(estimate, "unlinked_seams", lambda run, image_set, posed: [30])
     monkeypatch.setattr(Estimate, "is_contradicted", property(lambda _: True))
     monkeypatch.setattr(Estimate, "is_confirmed", property(lambda _: is_right))
     report = match(tmp_path / "a.db", scene, image_path=joint.image_path, options=OPTIONS)
