@@ -7,7 +7,18 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from synthetic_scene import CAMERA_PARAMS, HEIGHT, WIDTH
+from synthetic_scene import HEIGHT, WIDTH
+from view_pairs import (
+    ANGLE,
+    CAMERA,
+    PAIR,
+    TURN,
+    TURNED,
+    separate_pairs,
+    turned_views,
+    two_views,
+    verified,
+)
 
 from colmap_av1.geometry.cameras import make_camera
 from colmap_av1.matching.initial_pairs import PreparedStart, prepare_start
@@ -26,48 +37,7 @@ from colmap_av1.matching.verify import verify_pairs
 from colmap_av1.options import CameraOptions
 from colmap_av1.util.progress import Clock
 
-CAMERA = make_camera(CameraOptions(camera_params=CAMERA_PARAMS), WIDTH, HEIGHT)
-TURN = Rotation.from_euler("y", 20, degrees=True).as_matrix()
-TURNED = np.column_stack([TURN, [0, 0, 1] - TURN[:, 2]])
 TOWARDS = np.column_stack([np.eye(3), [-0.16, 0.02, -0.16]])
-PAIR = np.array([[0, 1]], dtype=np.int32)
-ANGLE = 6.0
-
-
-def two_views(
-    bend: float, rng: np.random.Generator, count: int = 160, angle: float = ANGLE
-) -> tuple[list[ImageKeypoints], NDArray[np.uint32]]:
-    """Two views of a curved wall, `angle` degrees apart."""
-    x = rng.uniform((-0.4, -0.25), (0.4, 0.25), (count, 2))
-    depth = 1 + 0.3 * x[:, 0] + bend * (x**2).sum(axis=1)
-    points = np.c_[x * depth[:, None], depth]
-    turn = Rotation.from_euler("y", -angle / 2, degrees=True).as_matrix()
-    moved = (points - [np.radians(angle), 0, 0]) @ turn.T
-    keypoints = []
-    for seen in (points, moved):
-        xy = CAMERA.img_from_cam(seen) + rng.normal(0, 0.15, (count, 2))
-        keypoints.append(ImageKeypoints(xy.astype(np.float32), np.arange(count)))
-    own = np.arange(count, dtype=np.uint32)
-    return keypoints, np.c_[own, own]
-
-
-def turned_views(
-    spread: float, depth: float, count: int, rng: np.random.Generator
-) -> tuple[list[ImageKeypoints], NDArray[np.uint32]]:
-    """Two views, 20 degrees apart, of points within `spread` of the axis and `depth` of 1."""
-    x = rng.uniform((-spread, -spread), (spread, spread), (count, 2))
-    points = np.c_[x, np.ones(count)] * (1 + rng.uniform(-depth, depth, count))[:, None]
-    moved = points @ TURN.T + TURNED[:, 3]
-    keypoints = []
-    for seen in (points, moved):
-        xy = CAMERA.img_from_cam(seen) + rng.normal(0, 0.3, (count, 2))
-        keypoints.append(ImageKeypoints(xy.astype(np.float32), np.arange(count)))
-    own = np.arange(count, dtype=np.uint32)
-    return keypoints, np.c_[own, own]
-
-
-def verified(keypoints: list[ImageKeypoints], matches: NDArray[np.uint32]) -> TwoViewGeometry:
-    return verify_pairs(keypoints, PAIR, [matches], CAMERA)[0]
 
 
 def demoted(keypoints: list[ImageKeypoints], geometry: TwoViewGeometry) -> TwoViewGeometry:
@@ -224,29 +194,9 @@ def prepared(
     poses: list[NDArray[np.float64] | None],
     models: list[int] | None = None,
 ) -> PreparedStart:
-    """Prepare pairs of images, given the poses of their second images.
-
-    The images of a pair are no neighbours. With None, the pose of both images is unknown. `models`
-    gives the model of each pair; without it, all are in one.
-    """
-    models = models or [0] * len(views)
-    nothing = np.empty((0, 2), np.float32)
-    keypoints = [ImageKeypoints(nothing, np.arange(0)) for i in range(8 * len(views))]
-    known: list[list[NDArray[np.float64] | None]] = [
-        [None] * len(keypoints) for _ in range(1 + max(models))
-    ]
-    pairs = np.array([[8 * i, 8 * i + 4] for i in range(len(views))], dtype=np.int32)
-    for i, ((own, _), pose) in enumerate(zip(views, poses, strict=True)):
-        first, second = pairs[i].tolist()
-        keypoints[first], keypoints[second] = own
-        if pose is not None:
-            model = known[models[i]]
-            model[first], model[second] = np.eye(3, 4), pose
-    geometries = [verified(*own) for own in views]
-    matched = MatchedImages(
-        keypoints, pairs, [g.inlier_matches for g in geometries], geometries, False
-    )
-    return prepare_start(matched, [CAMERA] * len(keypoints), Clock(), known)
+    """Prepare separate pairs of images, see `separate_pairs`."""
+    matched, known = separate_pairs(views, poses, models)
+    return prepare_start(matched, [CAMERA] * len(matched.keypoints), Clock(), known)
 
 
 def num_inliers(
