@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import pytest
 from image_sets import images, tracks_from
+from stage_results import MATCHES
 
-from colmap_av1.matching.depth import DepthEvidence
 from colmap_av1.matching.gaps import Gap
 from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.options import LinkOptions, MatchOptions, ReconstructOptions
@@ -16,7 +17,6 @@ from colmap_av1.poses.estimate import unlinked_seams
 from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.estimate_tracks import EstimateTracks
 from colmap_av1.poses.mapping_stage import MappedResult
-from colmap_av1.poses.match_stage import MatchesResult
 from colmap_av1.poses.run import Run
 from colmap_av1.util.run_context import RunContext
 from colmap_av1.util.stages import Kept
@@ -34,19 +34,7 @@ def estimate_with(links: LinkReport, adjusted: dict[str, Any] | None) -> Estimat
 
     The poses are not adjusted if it is None.
     """
-    matches = MatchesResult(
-        links=links,
-        warnings=(),
-        key_images=tuple(range(40)),
-        num_pose_tracks=1000,
-        assumes_video_focal_length=True,
-        forward_motion=False,
-        depth=DepthEvidence(0, 0, is_focal_length_known=False),
-        num_pairs=100,
-        num_flat_pairs=0,
-        num_verified_pairs=100,
-        keypoints_per_image=500.0,
-    )
+    matches = replace(MATCHES, links=links)
     mapped = MappedResult("mapped.npz", 40, mapper="global", other_models=())
     sound: dict[str, Any] = {
         "doubtful_seams": (),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other order breaks writing PNG files later
@@ -10,19 +11,17 @@ import pytest
 from image_sets import images
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from stage_results import MATCHES
 
 from colmap_av1.geometry.colmap_model import ModelImage
 from colmap_av1.geometry.posed_model import PosedModel, write_posed_model
 from colmap_av1.images.inputs import Inputs
-from colmap_av1.matching.depth import DepthEvidence
-from colmap_av1.matching.links.report import LinkReport
 from colmap_av1.options import CameraOptions, MatchOptions, ReconstructOptions
 from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.estimate_tracks import EstimateTracks
 from colmap_av1.poses.further_models import further_poses, keeps_intrinsics
 from colmap_av1.poses.mapping_stage import MappedResult
-from colmap_av1.poses.match_stage import MatchesResult
 from colmap_av1.poses.posed_images import read_poses
 from colmap_av1.poses.run import Run
 from colmap_av1.tracks.tracks import Tracks
@@ -125,18 +124,8 @@ def parts_of_second(
     size = (WIDTH, HEIGHT)
     nothing = Tracks.empty(NUM_FIRST + NUM_SECOND, size)
     np.savez(stages / "links.npz", **vars(nothing), contradicted=np.empty(0, np.int32))
-    matches = MatchesResult(
-        links=LinkReport(),
-        warnings=(),
-        key_images=tuple(range(len(names))),
-        num_pose_tracks=tracks.num_tracks,
-        assumes_video_focal_length=False,
-        forward_motion=False,
-        depth=DepthEvidence(0, 0, is_focal_length_known=False),
-        num_pairs=0,
-        num_flat_pairs=0,
-        num_verified_pairs=0,
-        keypoints_per_image=0.0,
+    matches = replace(
+        MATCHES, key_images=tuple(range(len(names))), num_pose_tracks=tracks.num_tracks
     )
     mapped = MappedResult("first.npz", NUM_FIRST, "incremental", ("second.npz",))
     adjusted = AdjustedResult("first.npz", NUM_FIRST, 0, (), (), (), 0.0, None, False, False)

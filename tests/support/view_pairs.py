@@ -31,12 +31,7 @@ def two_views(
     points = np.c_[x * depth[:, None], depth]
     turn = Rotation.from_euler("y", -angle / 2, degrees=True).as_matrix()
     moved = (points - [np.radians(angle), 0, 0]) @ turn.T
-    keypoints = []
-    for seen in (points, moved):
-        xy = CAMERA.img_from_cam(seen) + rng.normal(0, 0.15, (count, 2))
-        keypoints.append(ImageKeypoints(xy.astype(np.float32), np.arange(count)))
-    own = np.arange(count, dtype=np.uint32)
-    return keypoints, np.c_[own, own]
+    return _seen(points, moved, 0.15, rng)
 
 
 def turned_views(
@@ -46,11 +41,18 @@ def turned_views(
     x = rng.uniform((-spread, -spread), (spread, spread), (count, 2))
     points = np.c_[x, np.ones(count)] * (1 + rng.uniform(-depth, depth, count))[:, None]
     moved = points @ TURN.T + TURNED[:, 3]
+    return _seen(points, moved, 0.3, rng)
+
+
+def _seen(
+    points: NDArray[np.float64], moved: NDArray[np.float64], noise: float, rng: np.random.Generator
+) -> tuple[list[ImageKeypoints], NDArray[np.uint32]]:
+    """Keypoints of points in the coordinates of two cameras, with noise in pixels."""
+    own = np.arange(len(points), dtype=np.uint32)
     keypoints = []
     for seen in (points, moved):
-        xy = CAMERA.img_from_cam(seen) + rng.normal(0, 0.3, (count, 2))
-        keypoints.append(ImageKeypoints(xy.astype(np.float32), np.arange(count)))
-    own = np.arange(count, dtype=np.uint32)
+        xy = CAMERA.img_from_cam(seen) + rng.normal(0, noise, (len(points), 2))
+        keypoints.append(ImageKeypoints(xy.astype(np.float32), np.arange(len(points))))
     return keypoints, np.c_[own, own]
 
 
