@@ -159,7 +159,10 @@ def prepare_start(
             demote = search.bad_pairs_of_limits([limits], demote, most)
             if limits == SMALL_ANGLES:  # or the mapper begins without options
                 default = [DEFAULT_LIMITS, *DEFAULT_LIMITS.relaxed]
-                demote = search.bad_pairs_of_limits(default, demote, most)
+                more = search.bad_pairs_of_limits(default, demote, most)
+                more, has_good = search.bad_pairs(limits, more, most)
+                # If all good pairs have about 8 degrees, none would be left for `limits`.
+                demote = more if has_good else demote
             for number in range(1, len(known)):
                 own = search.of_model(number)
                 demote = own.bad_pairs_of_limits([limits, *limits.relaxed], demote, most)

@@ -209,6 +209,15 @@ def num_inliers(
     return [len(geometry.inlier_matches) for geometry in matched.geometries]
 
 
+def test_a_good_pair_is_left_if_all_pairs_have_small_angles() -> None:
+    """These could all be demoted for a mapper without options, which begins to accept them at 8."""
+    angle = 7.0
+    turn = Rotation.from_euler("y", -angle / 2, degrees=True).as_matrix()
+    pose = np.column_stack([turn, turn @ [-1, 0, 0]])
+    views = [two_views(0.5, np.random.default_rng(3), 300, angle)] * 4
+    assert num_inliers(views, [pose] * 4) == [300] * 4
+
+
 def towards_a_wall(rng: np.random.Generator) -> tuple[list[ImageKeypoints], NDArray[np.uint32]]:
     """Two views of a wall, for which the mapper finds a wrong pose."""
     x = rng.uniform((-0.4, -0.3), (0.4, 0.3), (600, 2))
