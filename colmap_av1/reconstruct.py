@@ -270,24 +270,25 @@ def reconstruct(
 
 
 def _check_no_model_of_others(output: Path, inputs: Inputs) -> None:
-    """Raise `OptionError` if the output is a finished model of other videos.
+    """Raise `OptionError` if the output is a finished model that has none of these videos.
 
-    The same videos may have another path, or other contents.
+    Only what is needed is read, as the report may be of another version.
     """
     try:
-        earlier = read_report(output)
-    except ModelError:
+        earlier = read_output_report(output)
+        digests, names = earlier["video_digests"], [Path(path).name for path in earlier["videos"]]
+    except FileNotFoundError:
         return
-    names = [path.name for path in earlier.videos]
-    if any(
-        video.path.name in names or file_digest(video.path) in earlier.video_digests
-        for video in inputs.videos
-    ):
-        return
-    raise OptionError(
-        f"{output}: has the model of {', '.join(names)}: give another folder, or --overwrite to "
-        "replace it"
-    )
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise OptionError(
+            f"{output / REPORT}: cannot be read: give another folder, or --overwrite to replace "
+            "the model"
+        ) from error
+    if not any(file_digest(video.path) in digests for video in inputs.videos):
+        raise OptionError(
+            f"{output}: has the model of {', '.join(names)}: give another folder, or --overwrite "
+            "to replace it"
+        )
 
 
 def _as_converted(options: ReconstructOptions) -> MatchOptions:
