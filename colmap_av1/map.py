@@ -100,7 +100,8 @@ def map_database(
         overwrite: replace an output that has models and nothing else.
 
     Raises:
-        DatabaseError: the database is missing, unreadable, or has no matches that a mapper can use.
+        DatabaseError: the database is missing, unreadable, or has no matches that a mapper can use,
+            or the matches do not determine depth.
         ImageError: an image of the database is missing from the folder, or the one that is examined
             of each camera has another size.
         ModelError: the mapper fails or finds no model; the message names its log.
@@ -129,9 +130,9 @@ def map_database(
             )
         if not num_registered:
             raise ModelError(
-                f"{database}: COLMAP's {options.mapper} mapper finds no model, its images "
-                "share too few matches or have too little parallax: see 'colmap-av1 check' and "
-                f"{log}, try the other --mapper, or give --camera_params when matching"
+                f"{database}: COLMAP's {options.mapper} mapper finds no model, probably because "
+                "the images share too few matches or have too little parallax: see 'colmap-av1 "
+                f"check' and {log}, try the other --mapper, or give --camera_params when matching"
             )
         with clock.measure("place"):
             try:
@@ -268,7 +269,10 @@ def _missing(
         return f"{len(missing)} of {num_images} images are not registered: {some_names(missing)}"
     further = ", ".join(f"'{number}' has {size}" for number, size in enumerate(others, start=1))
     if largest == num_images:
-        return f"model '0' has all {num_images} images, {further} of them again: ignore the others"
+        return (
+            f"model '0' has all {num_images} images; {further} of them again: ignore the other "
+            "models"
+        )
     return (
         f"no model has all {num_images} images: '0' has {largest}, {further}; each model has its "
         "own coordinates"

@@ -80,6 +80,8 @@ def match(
             to match.
         BitstreamError: a stream is damaged, and `strict` is set or the damage is before the
             second frame.
+        LimitError: a frame is larger than `options.read.max_frame_size`.
+        EncodeError: no AV1 encoder works, or it fails.
         ImageError: images or names do not match the video, or a photo cannot be read.
         DatabaseError: the database is locked, is not a COLMAP database, does not match the video,
             or has features of its images, which `options.on_existing` does not allow.

@@ -45,7 +45,8 @@ class MatchReport:
             to 1 (longest); empty without tracks.
         num_observations: keypoints of all images.
         focal_length: focal length of the first video in pixel heights, if it was estimated; None if
-            it was given, or if it is not observable and the camera has COLMAP's default.
+            it was given, or if it is not observable and the camera has an assumed one. Without a
+            joint estimate, also None if it is from the container.
         read_outs: rolling-shutter read-out time of each video in milliseconds, from the first row
             to the last; None if the keypoints were not corrected for it.
         num_pairs: image pairs written.

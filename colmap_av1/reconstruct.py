@@ -93,8 +93,8 @@ class ReconstructReport:
             these were not looked for.
         num_key_images: number of key images. COLMAP's mapper estimates their poses; the others are
             registered by resection.
-        num_registered: number of registered images. Only these are written.
-        registered: number of registered images of each video, by name, if there are several.
+        num_registered: number of registered images of the first model, in `sparse/0`.
+        registered: the same for each video, by name, if there are several.
         other_models: further models of images that are not connected to the first model, in the
             folders `model_1`, ... of the output.
         num_tracks: number of tracks of the videos.
@@ -203,7 +203,9 @@ def reconstruct(
         VideoError: a video cannot be read, or has no motion to match.
         BitstreamError: a stream is damaged, and `strict` is set or the damage is before the
             second frame.
-        ImageError: images cannot be chosen.
+        LimitError: a frame is larger than `options.match.read.max_frame_size`.
+        EncodeError: no AV1 encoder works, or it fails.
+        ImageError: images cannot be chosen, or a photo or mask cannot be read.
         ModelError: no poses are found.
         WriteError: the output cannot be written.
         OptionError: an option does not fit the video, the folder has other contents or the model of

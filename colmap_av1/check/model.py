@@ -94,7 +94,7 @@ def check_model(
             names.update(name for (name,) in connection.execute("SELECT name FROM images"))
     return ModelCheck(
         figures=figures,
-        seams=model_seams(posed, all_images=sorted(names, key=natural_key)),
+        seams=model_seams(posed, sorted(names, key=natural_key)),
         expected_error=expected_error(posed),
         crossings=None if database is None else model_crossings(model, Path(database)),
         long_range=long_range,

@@ -58,8 +58,9 @@ def new_cameras(
 ) -> ImageCameras:
     """Create a camera for each video, and one for the photos of each physical camera and size.
 
-    Given intrinsics apply to videos only. Without them, the focal length of a video is estimated
-    from its tracks or read from its container. Photos take their focal length from EXIF.
+    Given intrinsics apply to videos, and to photos only if these share the camera. Without given
+    intrinsics, the focal length of a video is estimated from its tracks or read from its container.
+    Photos take their focal length from EXIF.
 
     Args:
         paired: the images.

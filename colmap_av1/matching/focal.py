@@ -28,7 +28,7 @@ _IMAGES_PER_PAIR, _LEAST_PAIRS, _MOST_PAIRS = 2.5, 40, 80
 # Number of matches per pair. About the second number of matches of each candidate is enough to
 # choose the pair with the widest parallax.
 _NUM_MATCHES = 200
-_NUM_GLANCED = 64
+_NUM_COMPARED = 64
 _MIN_PAIRS = 8
 _MIN_MATCHES = 50
 # Scale of the Cauchy loss in pixels.
@@ -164,7 +164,7 @@ def _widest_pairs(
     for pair, ((i, j), rows) in enumerate(zip(pairs.tolist(), matches, strict=True)):
         if len(rows) < _MIN_MATCHES:
             continue
-        some = rows[:: max(1, len(rows) // _NUM_GLANCED)]
+        some = rows[:: max(1, len(rows) // _NUM_COMPARED)]
         motion = keypoints[j].xy.take(some[:, 1], axis=0) - keypoints[i].xy.take(some[:, 0], axis=0)
         motion = (motion - _median(motion)) * shape
         spread = float(_median(np.hypot(motion[:, 0], motion[:, 1])))

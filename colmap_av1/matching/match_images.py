@@ -80,7 +80,7 @@ def match_images(
         images_apart: if the images are a selection, the number of images that each represents.
 
     Raises:
-        VideoError: nothing connects any two images.
+        VideoError: nothing connects any two images, or a single video is shorter than a track.
     """
     paired = pair_videos(image_set, videos, options, context, name)
     made = cameras(paired)

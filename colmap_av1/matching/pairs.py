@@ -14,9 +14,9 @@ from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.arrays import Bools, Ints
 from colmap_av1.util.grouping import groups, indices_in
 
-# Spans up to this many images are paired at every image. Longer spans are paired at every n-th
-# image only, where n grows with the span, so the number of pairs stays linear in the number of
-# images even if tracks last for the whole video.
+# Spans below twice this many images are paired at every image. Longer spans are paired at every
+# n-th image only, n being the span divided by this number, so the number of pairs stays linear in
+# the number of images even if tracks last for the whole video.
 _UNTHINNED_SPAN = 64
 # Distances in images at which all pairs that share enough tracks are kept.
 _NEAR = tuple(range(1, 11))
@@ -83,7 +83,7 @@ def image_keypoints(tracks: Tracks, frames: Sequence[int]) -> list[ImageKeypoint
             xy=np.ascontiguousarray(tracks.xy[kept[own]], dtype=np.float32),
             track=track[kept[own]],
         )
-        for frame, own in zip(chosen, groups(image[kept], chosen.size), strict=True)
+        for own in groups(image[kept], chosen.size)
     ]
 
 

@@ -236,11 +236,19 @@ def planar_share(options: VerifyOptions) -> float:
 def _again_on_inliers(
     refine: Callable[[Any, Floats, Floats], Model],
     found: Model,
-    model: Any,
+    start: Any,
     points: MatchedPoints,
     search: Search,
 ) -> Model:
-    """Refine a model with many outliers once more, on its inliers."""
+    """Refine a model with many outliers once more, on its inliers.
+
+    Args:
+        refine: refines a model with matches [2, n] of both images.
+        found: the model.
+        start: what `refine` starts from, PoseLib's pose or a matrix.
+        points: the matches.
+        search: the options of the search.
+    """
     if found.matrix is None or found.count >= _TRUSTED_SHARE * points.a.shape[1]:
         return found
     agree = epipolar_inliers(
@@ -248,7 +256,7 @@ def _again_on_inliers(
     )
     if np.count_nonzero(agree) < MIN_MATCHES:
         return found
-    again = refine(model, points.spread_a[:, agree], points.spread_b[:, agree])
+    again = refine(start, points.spread_a[:, agree], points.spread_b[:, agree])
     return min(found, again, key=lambda model: _epipolar_loss(model, points))
 
 

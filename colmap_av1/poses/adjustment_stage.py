@@ -63,8 +63,9 @@ class AdjustedResult(PosesResult):
     """Result of `adjustment_stage`.
 
     Attributes:
-        num_motion_points: number of points of motion tracks. They come first; points of corners
-            and links follow.
+        num_motion_points: number of points of motion tracks. They come first; points of links, then
+            those of corners follow.
+        num_link_points: number of points of links.
         doubtful_seams: names of the images before and after each of `Seams.doubtful`.
         few_point_seams: names of the images before and after each of `Seams.few_points`.
         scale_lost_seams: names of the images before and after each of `Seams.worst_scale_lost`.
@@ -77,6 +78,7 @@ class AdjustedResult(PosesResult):
     """
 
     num_motion_points: int
+    num_link_points: int
     doubtful_seams: tuple[tuple[str, str], ...]
     few_point_seams: tuple[tuple[str, str], ...]
     scale_lost_seams: tuple[tuple[str, str], ...]
@@ -125,14 +127,14 @@ def adjustment_stage(
         if tracks.has_picture_positions and has_gaps:
             with run.clock.measure("refinement"):
                 spread = follow_occluded(run, spread, registered)
-        linked = tracks.links.keep_frames(registered.frames)
-        sets = [(spread, FOR_POSES), (linked, FOR_POSES)]
+        linked = tracks.link_tracks.keep_frames(registered.frames)
+        sets = [(spread, FOR_POSES), (linked, FOR_POSES)]  # motion tracks and links come first
         if tracks.has_picture_positions:
             with run.clock.measure("refinement"):
                 guide = Tracks.concatenate(spread, linked)
                 followed, registered = corners_in_images(run, guide, registered)
             few = spread.every_nth(_NTH_WITH_CORNERS).split_to_length(_LENGTH_WITH_CORNERS)
-            sets = [(few, _WITH_CORNERS), (Tracks.concatenate(linked, followed), FROM_PICTURES)]
+            sets = [(few, _WITH_CORNERS), (linked, FROM_PICTURES), (followed, FROM_PICTURES)]
         with run.clock.measure("adjustment"):
             points = [_triangulated_points(run, registered, some, limits) for some, limits in sets]
             check_agreement(sum(len(part.xyz) for part in points), spread.num_tracks)
@@ -149,17 +151,18 @@ def adjustment_stage(
             trimmed = without_sparse_images(adjusted.model)
         names = image_set.images.names
         photos = names[image_set.photos.start :]
-        seams = model_seams(trimmed.model, photos, names)
+        seams = model_seams(trimmed.model, names, photos)
         with run.clock.measure("adjustment"):
             final = with_own_cameras(run, trimmed.model)
         kept = adjusted.kept_points[trimmed.kept_points][final.kept_points]
-        is_motion = kept < len(points[0].xyz)
+        num_motion, num_links = (len(part.xyz) for part in points[:2])
         result = final.model
         write_posed_model(partial / f"adjusted{suffix}.npz", result)
         return AdjustedResult(
             poses=f"adjusted{suffix}.npz",
             num_registered=len(result.images),
-            num_motion_points=int(is_motion.sum()),
+            num_motion_points=int((kept < num_motion).sum()),
+            num_link_points=int(((kept >= num_motion) & (kept < num_motion + num_links)).sum()),
             doubtful_seams=tuple(seams.pairs[i] for i in seams.doubtful),
             few_point_seams=tuple(seams.pairs[i] for i in seams.few_points),
             scale_lost_seams=tuple(seams.pairs[i] for i in seams.worst_scale_lost),

@@ -42,12 +42,12 @@ class _Plan:
         doubted: frames after seams where links replace motion.
         links: "sift": look for loop closures in all videos; "none": use no links; None: as in the
             options of the run.
-        first: file of the mapper's model to continue with; None for the largest.
+        model_file: file of the mapper's model to continue with; None for the largest.
     """
 
     doubted: tuple[int, ...] = ()
     links: Literal["sift", "none"] | None = None
-    first: str | None = None
+    model_file: str | None = None
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class _Estimates:
     def mapped(self, plan: _Plan) -> KeyImageModels:
         """The mapper's models of the key images."""
         return self._mapped.get(
-            replace(plan, first=None),
+            replace(plan, model_file=None),
             lambda: map_key_images(
                 self._run(plan), self._videos, self.image_set, doubted=plan.doubted
             ),
@@ -124,7 +124,7 @@ class _Estimates:
         return self._whole.get(
             plan,
             lambda: pose_images(
-                self._run(plan), self._videos, self.image_set, self.mapped(plan), plan.first
+                self._run(plan), self._videos, self.image_set, self.mapped(plan), plan.model_file
             ),
         )
 
@@ -185,7 +185,7 @@ def _first_estimate(estimates: _Estimates) -> _FirstEstimate:
 
 
 def _further_links(estimates: _Estimates, first: _FirstEstimate) -> _Plan:
-    """Whether to use further links: not if pictures contradict only the poses with them.
+    """The plan with further links; the first plan if pictures contradict only the poses with them.
 
     Links may follow an object that moves.
     """
@@ -197,13 +197,16 @@ def _further_links(estimates: _Estimates, first: _FirstEstimate) -> _Plan:
         return _FIRST_PLAN
     if not first.can_be_kept or not linked.is_contradicted:
         return first.further
-    plain = estimates.outcome(_FIRST_PLAN)
+    try:
+        plain = estimates.outcome(_FIRST_PLAN)
+    except ModelError:  # too few tracks agree with the poses after a split
+        return first.further
     is_large = plain.num_registered >= _LEAST_SHARE * linked.num_registered
     return _FIRST_PLAN if is_large and not plain.is_contradicted else first.further
 
 
 def _used_links(estimates: _Estimates, plan: _Plan) -> _Plan:
-    """Whether to use links at all: not if pictures contradict only the poses with links.
+    """The same plan, or one without links if pictures contradict only the poses with links.
 
     Several videos, and photos, are connected by links only.
     """
@@ -211,7 +214,7 @@ def _used_links(estimates: _Estimates, plan: _Plan) -> _Plan:
     may_mislead = (
         estimates.run.options.match.links.links == "auto"
         and estimates.image_set.num_sequences == 1
-        and estimates.split(plan).tracks.links.num_tracks > 0
+        and estimates.split(plan).tracks.link_tracks.num_tracks > 0
     )
     if not (may_mislead and linked.is_contradicted):
         return plan
@@ -225,14 +228,14 @@ def _used_links(estimates: _Estimates, plan: _Plan) -> _Plan:
 
 
 def _first_model(estimates: _Estimates, plan: _Plan) -> _Plan:
-    """Which of the mapper's models becomes the first: the second, if the first is split smaller."""
+    """The same plan, or one with the mapper's second model if the first is split smaller."""
     if estimates.split(plan) is estimates.whole(plan):
         return plan
     size = estimates.outcome(plan).num_registered
     other = _larger_model(estimates, plan, size)
     if other is None:
         return plan
-    with_other = replace(plan, first=other)
+    with_other = replace(plan, model_file=other)
     try:
         second = estimates.outcome(with_other)
     except ModelError:  # too few tracks agree with its poses
@@ -243,12 +246,12 @@ def _first_model(estimates: _Estimates, plan: _Plan) -> _Plan:
 
 def _larger_model(estimates: _Estimates, plan: _Plan, size: int) -> str | None:
     """The file of the mapper's second model; None if it has no more than `size` images."""
-    mapped = estimates.mapped(plan)
-    others = mapped.models.result.other_models  # sorted by size
+    found = estimates.mapped(plan)
+    others = found.mapped.result.other_models  # sorted by size
     if not others:
         return None
     second = read_posed_model(estimates.run.stages / others[0])
-    is_larger = num_nearest(second, estimates.image_set, mapped.keyed) > size
+    is_larger = num_nearest(second, estimates.image_set, found.key_images) > size
     return others[0] if is_larger else None
 
 

@@ -124,26 +124,27 @@ class KeyImageModels:
     """The matched images and the mapper's models of them.
 
     Attributes:
-        matched: the database of the key images.
-        keyed: the key images.
-        models: the mapper's models.
+        matches: the database of the key images.
+        key_images: these images.
+        mapped: the mapper's models.
     """
 
-    matched: Kept[MatchesResult]
-    keyed: ImageSet
-    models: Kept[MappedResult]
+    matches: Kept[MatchesResult]
+    key_images: ImageSet
+    mapped: Kept[MappedResult]
 
 
 def map_key_images(
     run: Run, videos: Sequence[VideoTracks], image_set: ImageSet, *, doubted: Sequence[int]
 ) -> KeyImageModels:
     """Match and map the key images; `doubted` as in `match_stage`."""
-    matched = match_stage(run, videos, image_set, doubted)
-    depth = matched.result.depth
+    matches = match_stage(run, videos, image_set, doubted)
+    depth = matches.result.depth
     if not depth.is_observable:
         raise ModelError(f"{run.inputs.name}: {depth.warning}")
-    keyed = image_set.some(matched.result.key_images)
-    return KeyImageModels(matched, keyed, mapping_stage(run, matched, image_set, keyed))
+    key_images = image_set.some(matches.result.key_images)
+    mapped = mapping_stage(run, matches, image_set, key_images)
+    return KeyImageModels(matches, key_images, mapped)
 
 
 def pose_images(
@@ -151,7 +152,7 @@ def pose_images(
     videos: Sequence[VideoTracks],
     image_set: ImageSet,
     found: KeyImageModels,
-    first: str | None,
+    model_file: str | None,
 ) -> Estimate:
     """Resect and adjust one of the mapper's models, and map it again if it is doubtful.
 
@@ -160,21 +161,21 @@ def pose_images(
         videos: the tracks of each video.
         image_set: the images.
         found: the mapper's models.
-        first: file of the one to continue with; None for the largest.
+        model_file: file of the one to continue with; None for the largest.
     """
-    mapped = found.models
-    if first is not None:
-        mapped = with_model_first(run, mapped, first)
+    mapped = found.mapped
+    if model_file is not None:
+        mapped = with_model_first(run, mapped, model_file)
     estimate = mapped_poses(
         run,
-        found.matched,
+        found.matches,
         mapped,
         [own.tracks for own in videos],
         image_set,
         # Without a read-out time the tracks were not corrected.
         has_picture_positions=not any(own.read_out for own in videos),
     )
-    estimate = refined_poses(run, estimate, image_set, found.keyed)
+    estimate = refined_poses(run, estimate, image_set, found.key_images)
     if estimate.is_doubtful:
         estimate = remapped_poses(run, estimate, image_set, least_kept=_LEAST_KEPT)
     return _long_range_check(run, estimate, image_set)

@@ -16,7 +16,7 @@ class EstimateTracks:
     Attributes:
         motion: the motion tracks of all videos, cut at gaps that links replace and at seams of
             splits, without dynamic pixels.
-        links: SIFT links as tracks, without dynamic pixels.
+        link_tracks: SIFT links as tracks, without dynamic pixels.
         has_picture_positions: whether tracks have positions in the pictures; false if they were
             corrected for a rolling shutter. Pictures are not used then.
         dynamic_masks: masks that exclude dynamic pixels, by image name; empty if these are not
@@ -25,7 +25,7 @@ class EstimateTracks:
     """
 
     motion: Tracks
-    links: Tracks
+    link_tracks: Tracks
     has_picture_positions: bool
     dynamic_masks: Mapping[str, Mask] = field(default_factory=dict)
     masks_digest: str | None = None

@@ -34,11 +34,10 @@ _MAX_ERROR = 4.0
 _LEAST_FITTING = 0.4
 # Fewer tracks or points show nothing.
 _FEWEST = 30
-# A camera moves too fast across a seam if its speed exceeds this multiple of the speed that it
-# hardly ever exceeds elsewhere in the video. On 21 rendered walks, it was 2.2 where false links
+# A camera moves too fast across a seam if its speed exceeds this multiple of this quantile of its
+# speed elsewhere in the video. On 21 rendered walks, it was 2.2 where false links
 # bent the model, and at most 0.54 at other seams without tracks and with few points.
-_TOO_FAST = 1.5
-_HARDLY_EVER = 0.9  # a quantile
+_TOO_FAST, _SPEED_QUANTILE = 1.5, 0.9
 # A camera leaps if it is this much faster. On 12 rendered walks, it was 8.3 times as fast where a
 # model of few images was bent in a turn, and at most 1.7 times elsewhere.
 _LEAP = 3.0
@@ -180,7 +179,7 @@ def _relative_speeds(model: PosedModel, image_set: ImageSet) -> dict[tuple[str, 
         own = np.flatnonzero(image_set.sequence[index] == sequence)
         distance = np.linalg.norm(np.diff(centres[own], axis=0), axis=1)
         speed = distance / np.diff(images.frames[index[own]])
-        usual = np.quantile(speed, _HARDLY_EVER) if len(speed) else 0.0
+        usual = np.quantile(speed, _SPEED_QUANTILE) if len(speed) else 0.0
         names = [images.names[k] for k in index[own]]
         relative = np.divide(speed, usual, out=np.ones_like(speed), where=usual > 0)
         found |= dict(zip(pairwise(names), relative.tolist(), strict=True))

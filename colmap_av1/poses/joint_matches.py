@@ -38,9 +38,9 @@ from colmap_av1.poses.matched_observations import (
     limits_of_density,
     matched_observations,
 )
+from colmap_av1.poses.model_tracks import at_same_place, tracks_of_model
 from colmap_av1.poses.posed_images import PosedImages, posed_images_of, read_poses, triangulate_in
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_matches import at_same_place, tracks_of_model
 from colmap_av1.poses.unregistered import models_of_images, tracks_of_unregistered, within_models
 from colmap_av1.tracks.selection import select_tracks
 from colmap_av1.tracks.tracks import Tracks
@@ -50,8 +50,9 @@ from colmap_av1.util.texts import some_names
 from colmap_av1.video.coded_size import smaller_grey
 
 # An observation of the adjusted model is an outlier if its error exceeds both this many pixels and
-# this multiple of the median error, which is larger with a rolling shutter, for example.
-_LEAST_ERROR, _MEDIAN_ERRORS = 0.6, 4.0
+# this multiple of the median error, which is larger with a rolling shutter, for example. SIFT
+# features of links are less accurate than corners, and where there are links, there is little else.
+_LEAST_ERROR, _LEAST_ERROR_OF_LINKS, _MEDIAN_ERRORS = 0.6, 1.5, 4.0
 # Points of motion tracks need the mapper's smallest triangulation angle, and a depth error below
 # 50 %.
 _POINTS = TriangulateOptions(
@@ -84,7 +85,8 @@ class JointEstimate:
         long_range: median long-range epipolar error in pixels, over pairs of images ten or more
             apart; None if no such images have enough matches.
         long_range_largest: its 90th percentile.
-        dynamic_share: share of dynamic pixels, which have no matches.
+        dynamic_share: share of dynamic pixels, which have no matches; None if dynamic objects were
+            not looked for.
         focal_lengths: the shortest and the longest focal length of the registered images in pixels,
             in the cameras of the database: the estimated ones unless the images hardly determine
             them, or the database already has cameras.
@@ -194,7 +196,7 @@ def match_jointly(
         focal_length=_focal_length(run, cameras[0]),
         matched=matched,
         links=matches.links,
-        link_tracks=estimate.tracks.links,
+        link_tracks=estimate.tracks.link_tracks,
         track_lengths=paired.track_lengths,
         depth=matches.depth,
         warnings=(*matches.warnings, *warnings),
@@ -305,15 +307,29 @@ def _agreeing_tracks(
 def _agreeing_corners(model: _Model, image_set: ImageSet) -> tuple[Tracks, Floats]:
     """The corners and SIFT links used in the adjustment, without outliers, and their points."""
     known = model.known
-    errors = reprojection_errors(known)
     adjusted = tracks_of_model(known, image_set)
-    agrees = errors <= max(_LEAST_ERROR, _MEDIAN_ERRORS * float(np.median(errors)))
-    # Points of motion tracks come first.
-    agrees &= adjusted.track >= model.adjusted.num_motion_points
+    # Points of motion tracks come first, then those of links.
+    number = adjusted.track - model.adjusted.num_motion_points
+    agrees = are_inliers(reprojection_errors(known), number < model.adjusted.num_link_points)
+    agrees &= number >= 0
     agrees &= np.isin(adjusted.frame, model.registered.frames)
     enough = np.bincount(adjusted.track[agrees], minlength=adjusted.num_tracks) >= NUM_OBSERVATIONS
     kept = adjusted.keep_observations(agrees & enough[adjusted.track])
     return kept, known.points.xyz[enough]
+
+
+def are_inliers(errors: Floats, is_link: Bools) -> Bools:
+    """Which observations of an adjusted model are no outliers.
+
+    Args:
+        errors: float64 [num_observations] reprojection errors in pixels.
+        is_link: bool [num_observations] observations of SIFT links.
+
+    Returns:
+        bool [num_observations].
+    """
+    least = np.where(is_link, _LEAST_ERROR_OF_LINKS, _LEAST_ERROR)
+    return np.asarray(errors <= np.maximum(least, _MEDIAN_ERRORS * float(np.median(errors))))
 
 
 def _agreeing_motion(run: Run, tracks: Tracks, registered: PosedImages) -> tuple[Tracks, Floats]:

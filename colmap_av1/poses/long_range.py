@@ -49,7 +49,7 @@ _MIN_MATCHES = 30
 # Smallest number of pairs, all without matches, for which there is a warning. Sharp images, which
 # have at least this number of features, only count up to this angle: those of plants have few
 # matches beyond it.
-_MIN_IN_VAIN = 3
+_MIN_UNMATCHED = 3
 _SHARP_FEATURES = 200
 _SHARP_ANGLE = 15.0
 # Features of a model's image count up to this distance from the points that it observes, as a share
@@ -65,14 +65,14 @@ class LongRangeErrors:
         pairs: (name, name) of the images of each pair with enough matches.
         error: float64 [num_pairs] long-range epipolar error of each pair: median distance in pixels
             of its matches from the epipolar lines of the poses.
-        num_in_vain: number of pairs that should have matches by their poses, if none has any;
+        num_unmatched: number of pairs that should have matches by their poses, if none has any;
             otherwise 0.
         num_features: median number of features of the images; 0 if there are none.
     """
 
     pairs: tuple[tuple[str, str], ...]
     error: Floats
-    num_in_vain: int
+    num_unmatched: int
     num_features: int
 
     @property
@@ -101,7 +101,7 @@ class LongRangeErrors:
         Args:
             searched_loops: whether loop closures have been searched in all videos.
         """
-        if self.num_in_vain >= _MIN_IN_VAIN:
+        if self.num_unmatched >= _MIN_UNMATCHED:
             cause = "the poses are wrong"
             if self.num_features < _SHARP_FEATURES:
                 cause = (
@@ -109,8 +109,8 @@ class LongRangeErrors:
                     f"each, or {cause}"
                 )
             return (
-                f"{self.num_in_vain} pairs of images far apart in time overlap by their poses but "
-                f"show nothing in common: {cause}"
+                f"{self.num_unmatched} pairs of images far apart in time overlap by their poses "
+                f"but show nothing in common: {cause}"
             )
         if not self.contradicts_poses or self.worst is None:
             return None
@@ -185,7 +185,7 @@ class LongRangeCheck:
         return LongRangeErrors(
             tuple(names),
             np.array(errors),
-            num_in_vain=0 if len(found.pairs) else int(should_match.sum()),
+            num_unmatched=0 if len(found.pairs) else int(should_match.sum()),
             num_features=num_features,
         )
 

@@ -98,7 +98,7 @@ def map_poses(
     sizes: list[int] = []
     registered = 0
 
-    def hear(word: str, value: str) -> None:
+    def on_message(word: str, value: str) -> None:
         nonlocal registered, sizes
         if word == "registered":
             registered += 1
@@ -107,7 +107,7 @@ def map_poses(
             sizes = json.loads(value)
 
     failed = f"COLMAP's {options.mapper} mapper"
-    _run_in_process(settings, hear, log, failed=failed, hint="try the other --mapper")
+    _run_in_process(settings, on_message, log, failed=failed, hint="try the other --mapper")
     if sizes:
         _check_whole(output / "0")
     progress("poses", num_images, num_images)
@@ -186,8 +186,8 @@ def start_mapper(
         initial_pair: limits for the initial pair, by the names of the mapper's options.
 
     Returns:
-        Names of the images of a first model that remains smaller, none if the mapper starts none;
-        None if the model has enough images.
+        None if the first model reaches `num_images`. If it stays smaller, the names of its images,
+        an empty list if the mapper starts no model.
 
     Raises:
         ModelError: the mapper failed; the log holds the details.
@@ -199,13 +199,13 @@ def start_mapper(
     }
     names: list[str] | None = None
 
-    def hear(word: str, value: str) -> None:
+    def on_message(word: str, value: str) -> None:
         nonlocal names
         if word == "names":
             names = json.loads(value)
 
     hint = "'colmap mapper' shows more"
-    _run_in_process(settings, hear, log, failed="COLMAP's incremental mapper", hint=hint)
+    _run_in_process(settings, on_message, log, failed="COLMAP's incremental mapper", hint=hint)
     return names
 
 
@@ -269,13 +269,13 @@ def _check_whole(model: Path) -> None:
 
 def _run_in_process(
     settings: Settings,
-    hear: Callable[[str, str], None] | None,
+    on_message: Callable[[str, str], None] | None,
     log: Path,
     *,
     failed: str,
     hint: str,
 ) -> None:
-    """Run `run_child` in a process; `hear` is called with the names and values that it prints."""
+    """Run `run_child` in a process; `on_message` gets the names and values that it prints."""
     # The child finds libraries where this process does. Idle BLAS threads would spin.
     path, num_threads = os.pathsep.join(sys.path), str(settings["num_threads"])
     environment = {**os.environ, "PYTHONPATH": path, BLAS_THREADS: num_threads}
@@ -298,8 +298,8 @@ def _run_in_process(
                 done = word == "done"
                 if word == "failed":
                     reason = f" ({value})"
-                elif hear is not None:
-                    hear(word, value)
+                elif on_message is not None:
+                    on_message(word, value)
         except BaseException:
             process.kill()
             raise

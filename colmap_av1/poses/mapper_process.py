@@ -203,7 +203,7 @@ def _start(settings: StartSettings) -> list[str] | None:
         nonlocal num_images
         num_images = 2
 
-    def go_on() -> None:
+    def count_image() -> None:
         nonlocal num_images
         num_images += 1
         if num_images >= settings["num_images"]:
@@ -213,7 +213,7 @@ def _start(settings: StartSettings) -> list[str] | None:
     how.multiple_models = False
     output = Path(settings["output"]) / "start"
     output.mkdir(exist_ok=True)
-    callbacks: Any = {"initial_image_pair_callback": start, "next_image_callback": go_on}
+    callbacks: Any = {"initial_image_pair_callback": start, "next_image_callback": count_image}
     try:
         models = pycolmap.incremental_mapping(
             settings["database"], output, output, options=how, **callbacks

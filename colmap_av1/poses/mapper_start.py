@@ -95,8 +95,8 @@ def choose_mapper_start(
                 matched = tried(start, fixed_intrinsics=fixed_intrinsics)
         except ModelError:
             warnings.append(
-                "COLMAP's mapper failed in a trial on this database, and may fail again: if so, "
-                "its output tells why"
+                "COLMAP's mapper failed in a trial on this database and may fail again: its output "
+                "then gives the reason"
             )
     return MapperStart(
         matched=matched or start.matched,

@@ -20,7 +20,7 @@ from colmap_av1.matching.initial_pairs import PreparedStart, are_far, with_demot
 from colmap_av1.matching.mapper_limits import DEFAULT_LIMITS
 from colmap_av1.matching.matched_images import MatchedImages, connected_images
 from colmap_av1.options import MapOptions
-from colmap_av1.poses.mapper import start_mapper
+from colmap_av1.poses.mapper import LEAST_IMAGES, start_mapper
 from colmap_av1.util.arrays import Bools
 from colmap_av1.util.progress import Clock
 
@@ -30,8 +30,6 @@ _NUM_IMAGES = 10
 # If the focal length is a default, it has succeeded with this number of images, or with this share
 # of the largest set of images that matches connect, if that is less.
 _NUM_ASSUMED, _ASSUMED_SHARE = 30, 0.9
-# Fewest images of a model that can be judged.
-_LEAST_IMAGES = 3
 # Largest number of starts that are tried.
 _MAX_TRIALS = 5
 
@@ -71,7 +69,7 @@ def demote_failing_starts(
         enough = min(_NUM_ASSUMED, round(_ASSUMED_SHARE * int(most_connected)))
     else:
         enough = min(_NUM_IMAGES, np.unique(start.matched.pairs).size // 2)
-    num_images = max(_LEAST_IMAGES, enough)
+    num_images = max(LEAST_IMAGES, enough)
     options = MapOptions(
         mapper="incremental",
         refine_intrinsics=not fixed_intrinsics,

@@ -178,23 +178,24 @@ def num_nearest(model: PosedModel, image_set: ImageSet, keyed: ImageSet) -> int:
     return int(np.count_nonzero(is_in_model[nearest]))
 
 
-def with_model_first(run: Run, mapped: Kept[MappedResult], file: str) -> Kept[MappedResult]:
+def with_model_first(run: Run, mapped: Kept[MappedResult], model_file: str) -> Kept[MappedResult]:
     """The models of the mapper, with another one as the first.
 
     Args:
         run: the run.
         mapped: the models, see `mapping_stage`.
-        file: the file of the new first model.
+        model_file: the file of the new first model.
     """
-    num_registered = len(read_posed_model(run.stages / file).images)
-    others = [own for own in (mapped.result.poses, *mapped.result.other_models) if own != file]
+    num_registered = len(read_posed_model(run.stages / model_file).images)
+    before = (mapped.result.poses, *mapped.result.other_models)
+    others = [own for own in before if own != model_file]
     result = replace(
         mapped.result,
-        poses=file,
+        poses=model_file,
         num_registered=num_registered,
         other_models=tuple(others),
     )
-    return replace(mapped, result=result, digest=digest_of([mapped.digest, file]))
+    return replace(mapped, result=result, digest=digest_of([mapped.digest, model_file]))
 
 
 def _why_no_model(found: MatchesResult, mapper: str, camera: CameraOptions) -> str:

@@ -35,9 +35,9 @@ from colmap_av1.poses.adjusting import adjust_posed, mean_cost, refines_intrinsi
 from colmap_av1.poses.adjustment_stage import AdjustedResult
 from colmap_av1.poses.longest_tracks import keep_longest_tracks
 from colmap_av1.poses.mapping_stage import MappedResult, mapped_models
+from colmap_av1.poses.model_tracks import tracks_of_model
 from colmap_av1.poses.posed_images import FROM_PICTURES, posed_images_of, read_poses, triangulate_in
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_matches import tracks_of_model
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.stages import Kept, run_stage
 

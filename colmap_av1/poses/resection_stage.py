@@ -15,7 +15,6 @@ from colmap_av1.poses.posed_images import (
     FOR_POSES,
     PosedImages,
     PosesResult,
-    check_agreement,
     read_posed_images,
     triangulate_in,
 )
@@ -60,7 +59,6 @@ def _resect(run: Run, tracks: Tracks, image_set: ImageSet, known: PosedImages) -
     seen_thrice = run.pose_tracks(tracks).keep_observed_in(known.frames, _FEWEST_VIEWS)
     spread = select_tracks(seen_thrice.keep_frames(image_set.images.frames), _RESECTED)
     with_points = triangulate_in(run, known, spread, FOR_POSES)
-    check_agreement(len(with_points.points.xyz), with_points.points.num_tracks)
     pose_of = {
         frame: (image.camera_id, image.cam_from_world)
         for frame, image in zip(known.frames.tolist(), known.images, strict=True)

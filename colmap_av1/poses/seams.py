@@ -175,18 +175,15 @@ class Seams:
 
 
 def model_seams(
-    model: PosedModel,
-    photos: Collection[str] = (),
-    all_images: Sequence[str] = (),
+    model: PosedModel, all_images: Sequence[str], photos: Collection[str] = ()
 ) -> Seams:
     """Count the points at each seam of a model, see `Seams`.
 
     Args:
         model: the model, with points.
-        photos: names of photos, which have no neighbours in time.
         all_images: names of the images that were mapped, in the order of time. Those that the model
-            lacks count in the distance between two images. Empty: those of the model, in the
-            natural order of their names.
+            lacks count in the distance between two images.
+        photos: names of photos, which have no neighbours in time.
     """
     images, neighbours = images_in_time(model.images, all_images)
     views, point, xyz = _seen_points(model, images)
@@ -227,10 +224,8 @@ def model_seams(
         return np.cumsum(change)[:num_seams]
 
     crossing = between(views[near], views[near + 1])
-    rank = np.arange(num_images)
-    if all_images:
-        rank_of = {name: k for k, name in enumerate(all_images)}
-        rank = np.array([rank_of[image.name] for image in images], np.int64)
+    rank_of = {name: k for k, name in enumerate(all_images)}
+    rank = np.array([rank_of[image.name] for image in images], np.int64)
     near = near[np.diff(rank[views])[near] <= _REACH]
     soon = between(views[near], views[near + 1])
     num_points = _points_of_loose_stretches(crossing, soon, is_seam, views, point)

@@ -40,7 +40,7 @@ def tracks_of_unregistered(
         return Tracks.empty(motion.num_frames, (motion.width, motion.height))
     frames, frame_of = image_set.images.frames, image_set.images.frame_of
     some = select_tracks(run.pose_tracks(motion).keep_frames(frames), density)
-    seen = Tracks.concatenate(some, estimate.tracks.links.keep_frames(frames))
+    seen = Tracks.concatenate(some, estimate.tracks.link_tracks.keep_frames(frames))
     is_wanted = np.isin(seen.frame, [frame_of[name] for name in not_registered])
     return seen.keep_tracks(seen.having(is_wanted))
 

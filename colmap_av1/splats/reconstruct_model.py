@@ -277,7 +277,7 @@ def model_stage(
         views = views_of(images, cameras, valid)
         with clock.measure("points"):
             tracked, agreement = _tracked_points(
-                run, registered, views, Tracks.concatenate(tracks.motion, tracks.links)
+                run, registered, views, Tracks.concatenate(tracks.motion, tracks.link_tracks)
             )
             shows_dynamic = np.array([image.name in tracks.dynamic_masks for image in images])
             tracked = tracked.take(static_points(tracked, shows_dynamic))

@@ -25,13 +25,10 @@ def velocities(tracks: Tracks) -> Floats:
     through both neighbours, or the step to the only neighbour; 0 without neighbours. Velocities
     are averaged over cells of each picture.
     """
-    one, two = (_steps(tracks, shift) for shift in (1, 2))
-    ahead, behind = one, _back(one, 1)
-    far, far_behind = two, _back(two, 2)
-    both = (ahead + behind) / 2
-    cubic = _NEAR * (ahead + behind) + _FAR * (far + far_behind)
-    found = cubic
-    for other in (both, ahead, behind, 0.0):
+    ahead, far_ahead = (_steps(tracks, shift) for shift in (1, 2))
+    behind, far_behind = _back(ahead, 1), _back(far_ahead, 2)
+    found = _NEAR * (ahead + behind) + _FAR * (far_ahead + far_behind)
+    for other in ((ahead + behind) / 2, ahead, behind, 0.0):
         found = np.where(np.isfinite(found), found, other)
     return _mean_of_cells(tracks, found)
 

@@ -304,7 +304,10 @@ class Tracks:
         return self.keep_tracks(np.arange(self.num_tracks) % n == 0)
 
     def split_to_length(self, max_length: int) -> Tracks:
-        """Split each track into equal parts of at most `max_length` observations."""
+        """Split each track into parts of at most `max_length` observations.
+
+        All parts of a track but the last have the same length.
+        """
         lengths = self.lengths
         part = -(-lengths // -(-lengths // max_length))
         rank = np.arange(self.num_observations) - np.repeat(self.offsets[:-1], lengths)
@@ -432,6 +435,7 @@ def build_tracks(
         VideoError: no frame is shown.
         ValueError: the frames are not in bitstream order, or their arrays contradict
             each other.
+        TypeError: an element is not a `FrameMotion`.
 
     Examples:
         >>> from colmap_av1 import TrackOptions, build_tracks, read_motion

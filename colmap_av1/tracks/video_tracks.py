@@ -41,7 +41,7 @@ _REFINED = "tracks are refined"
 # Overlay tracks are reported if they are at least this share of all tracks.
 _NOTABLE_SHARE = 0.01
 # Approximate number of tracks in each frame whose ends are sampled if observations are kept in some
-# frames only, and the number of pixels of a unit of motion, which has at most one track.
+# frames only, and the number of pixels of a 4x4 unit of motion, which is assumed to have one track.
 _ENDS_PER_FRAME = 2000
 _PIXELS_PER_TRACK = 16
 

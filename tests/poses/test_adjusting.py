@@ -29,6 +29,7 @@ from colmap_av1.geometry.posed_model import (
     write_posed_model,
 )
 from colmap_av1.geometry.track_points import tracks_of_points
+from colmap_av1.images.image_set import ImageSet
 from colmap_av1.poses import adjusting
 from colmap_av1.poses.adjusting import (
     adjust_posed,
@@ -38,6 +39,7 @@ from colmap_av1.poses.adjusting import (
 from colmap_av1.poses.adjustment_stage import adjustment_stage
 from colmap_av1.poses.estimate_tracks import EstimateTracks
 from colmap_av1.poses.posed_images import PosesResult
+from colmap_av1.poses.resection_stage import resection_stage
 from colmap_av1.poses.run import Run
 from colmap_av1.poses.second_distortion import with_second_distortion
 from colmap_av1.reconstruct import ReconstructReport
@@ -131,6 +133,20 @@ def test_focal_length_is_observable_with_turns_but_not_on_a_straight_path() -> N
     assert errors[0.0] > 0.1
 
 
+def named(model: PosedModel, image_set: ImageSet) -> list[ModelImage]:
+    """The images of a model with the names of the images of a set."""
+    return [
+        replace(image, name=name)
+        for image, name in zip(model.images, image_set.images.names, strict=True)
+    ]
+
+
+def run_in(folder: Path) -> Run:
+    """A run with stages in a folder, and no inputs, which only other stages use."""
+    inputs: Any = None
+    return Run(inputs, (), (), folder, folder, ReconstructOptions(), RunContext())
+
+
 @pytest.mark.parametrize(
     ("turn", "is_assumed", "is_kept"), [(2.0, True, False), (0.0, True, True), (0.0, False, False)]
 )
@@ -145,14 +161,10 @@ def test_assumed_focal_length_is_kept_if_the_images_do_not_determine_another(
     exact, image_set = posed_scene(lens, turn), images(12)
     frames = np.arange(12, dtype=np.int32)
     motion = tracks_of_points(exact.points, frames, 12, (640, 480))
-    posed = [
-        replace(image, name=name)
-        for image, name in zip(exact.images, image_set.images.names, strict=True)
-    ]
+    posed = named(exact, image_set)
     write_posed_model(tmp_path / "poses.npz", PosedModel({1: assumed}, posed))
-    inputs: Any = None  # only used by other stages
     adjusted = adjustment_stage(
-        Run(inputs, (), (), tmp_path, tmp_path, ReconstructOptions(), RunContext()),
+        run_in(tmp_path),
         EstimateTracks(motion, tracks_from([], 12), has_picture_positions=False),
         image_set,
         Kept(PosesResult("poses.npz", 12), digest="", resumed=False),
@@ -162,6 +174,41 @@ def test_assumed_focal_length_is_kept_if_the_images_do_not_determine_another(
     if turn:
         found = read_posed_model(tmp_path / adjusted.poses)
         assert found.cameras[1].focal_length == pytest.approx(500, rel=0.005)
+
+
+def test_points_of_links_follow_those_of_motion(tmp_path: Path) -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 500.0, 640, 480)
+    exact, image_set = posed_scene(camera, 2.0), images(12)
+    every = tracks_of_points(exact.points, np.arange(12, dtype=np.int32), 12, (640, 480))
+    is_link = np.arange(every.num_tracks) % 3 == 0
+    motion, links = every.keep_tracks(~is_link), every.keep_tracks(is_link)
+    write_posed_model(tmp_path / "poses.npz", replace(exact, images=named(exact, image_set)))
+    adjusted = adjustment_stage(
+        run_in(tmp_path),
+        EstimateTracks(motion, links, has_picture_positions=False),
+        image_set,
+        Kept(PosesResult("poses.npz", 12), digest="", resumed=False),
+    ).result
+    assert min(adjusted.num_motion_points, adjusted.num_link_points) > 100
+    points = read_posed_model(tmp_path / adjusted.poses).points
+    first = points.offsets[adjusted.num_motion_points]
+    assert {*map(tuple, points.xy[:first].tolist())} <= {*map(tuple, motion.xy.tolist())}
+    assert {*map(tuple, points.xy[first:].tolist())} <= {*map(tuple, links.xy.tolist())}
+    assert len(points.xyz) == adjusted.num_motion_points + adjusted.num_link_points
+
+
+def test_images_between_are_not_registered_without_tracks(tmp_path: Path) -> None:
+    """The key images keep their poses, as in a model that only links connect."""
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 500.0, 640, 480)
+    exact, image_set = posed_scene(camera, 2.0), images(12)
+    keyed = image_set.some(range(0, 12, 2))
+    write_posed_model(tmp_path / "poses.npz", PosedModel({1: camera}, named(exact, image_set)[::2]))
+    poses = Kept(PosesResult("poses.npz", 6), digest="", resumed=False)
+    stage = resection_stage(run_in(tmp_path), tracks_from([], 12), image_set, keyed, poses)
+    found = read_posed_model(tmp_path / stage.result.poses)
+    assert [image.name for image in found.images] == keyed.images.names
+    for image, other in zip(found.images, exact.images[::2], strict=True):
+        np.testing.assert_array_equal(image.cam_from_world, other.cam_from_world)
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,7 @@ def estimate_with(links: LinkReport, adjusted: dict[str, Any] | None) -> Estimat
             "adjusted.npz",
             40,
             num_motion_points=1000,
+            num_link_points=0,
             usual_scaled=500.0,
             seams_warning=None,
             **{**sound, **adjusted},

@@ -128,7 +128,7 @@ def parts_of_second(
         MATCHES, key_images=tuple(range(len(names))), num_pose_tracks=tracks.num_tracks
     )
     mapped = MappedResult("first.npz", NUM_FIRST, "incremental", ("second.npz",))
-    adjusted = AdjustedResult("first.npz", NUM_FIRST, 0, (), (), (), 0.0, None, False, False)
+    adjusted = AdjustedResult("first.npz", NUM_FIRST, 0, 0, (), (), (), 0.0, None, False, False)
     estimate = Estimate(
         matches=Kept(matches, "matches", False),
         mapped=Kept(mapped, "mapped", False),

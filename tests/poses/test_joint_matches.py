@@ -37,6 +37,7 @@ from colmap_av1.options import (
 from colmap_av1.poses import estimate, long_range
 from colmap_av1.poses.estimate_steps import Estimate
 from colmap_av1.poses.initial_pair import initial_pair
+from colmap_av1.poses.joint_matches import are_inliers
 from colmap_av1.video.decoding import decode_frames
 
 # The pictures of the rendered clip are scaled by this factor.
@@ -109,6 +110,14 @@ def test_camera_of_the_database_is_the_estimated_one(joint: MatchReport, truth: 
     assert camera.has_prior_focal_length
     assert camera.focal_length_x == pytest.approx(joint.focal_length)
     assert camera.model_name == "RADIAL"
+
+
+@pytest.mark.parametrize(("median", "inliers"), [(0.15, [True, False]), (0.3, [True, True])])
+def test_links_may_have_larger_errors_than_corners(median: float, inliers: list[bool]) -> None:
+    """Unless all errors are large, as those of a rolling shutter."""
+    errors = np.array([1.0, 1.0, *[median] * 5])
+    is_link = np.arange(7) == 0
+    assert are_inliers(errors, is_link)[:2].tolist() == inliers
 
 
 def test_no_track_has_two_keypoints_in_an_image(joint: MatchReport) -> None:

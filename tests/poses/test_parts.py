@@ -27,9 +27,9 @@ from colmap_av1.poses.false_links import (
     misplaced_seams,
 )
 from colmap_av1.poses.mapping_stage import MappedResult
+from colmap_av1.poses.model_tracks import tracks_of_model
 from colmap_av1.poses.parts import certain_parts, parts_of, split_stage
 from colmap_av1.poses.run import Run
-from colmap_av1.poses.track_matches import tracks_of_model
 from colmap_av1.reconstruct import reconstruct
 from colmap_av1.tracks.tracks import Tracks
 from colmap_av1.util.run_context import RunContext
@@ -199,7 +199,7 @@ def test_a_jump_splits_a_model_only_if_nothing_else_does(
         image.cam_from_world[0, 3] -= 30
     write_posed_model(tmp_path / "adjusted.npz", known)
     seams = (seam(image_set, 11), seam(image_set, 23))
-    result = AdjustedResult("adjusted.npz", 36, 0, (), seams, (), 0.0, None, False, False)
+    result = AdjustedResult("adjusted.npz", 36, 0, 0, (), seams, (), 0.0, None, False, False)
     mapped = Kept(MappedResult("poses.npz", 36, "incremental", ()), "0", False)
     nothing = Tracks.empty(36, (640, 480))
     inputs: Any = None  # only used by earlier stages

@@ -32,7 +32,8 @@ _SOUND = 0.95
 def seams_of(
     model: pycolmap.Reconstruction, photos: Collection[str] = (), all_images: Sequence[str] = ()
 ) -> Seams:
-    return model_seams(posed_model(model, with_points=True), photos, all_images)
+    own = posed_model(model, with_points=True)
+    return model_seams(own, all_images or sorted(image.name for image in own.images), photos)
 
 
 def test_consistent_model_has_no_weak_seam(made: ReconstructReport) -> None:

@@ -84,7 +84,7 @@ def without_dynamic(
     return replace(
         tracks,
         motion=without_dynamic_tracks(tracks.motion, image_set, masks, run),
-        links=without_dynamic_links(tracks.links, image_set, masks),
+        link_tracks=without_dynamic_links(tracks.link_tracks, image_set, masks),
         dynamic_masks=masks,
         masks_digest=dynamic.digest,
     )

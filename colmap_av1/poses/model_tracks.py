@@ -21,7 +21,7 @@ def tracks_of_model(model: PosedModel, image_set: ImageSet) -> Tracks:
 
 
 def at_same_place(tracks: Tracks, others: Tracks, distance: float) -> Bools:
-    """Which tracks have an observation at the position of an observation of another track.
+    """Which tracks have an observation at the position of an observation of one of the others.
 
     Args:
         tracks: the tracks.
