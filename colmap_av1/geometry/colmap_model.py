@@ -62,6 +62,12 @@ def camera_centres(cam_from_world: Floats) -> Floats:
     return np.asarray(-np.einsum("nij,ni->nj", rotation, translation), dtype=np.float64)
 
 
+def relative_pose(a: Floats, b: Floats) -> Floats:
+    """The pose b_from_a, float64 [3, 4], of the poses a_from_world and b_from_world [3, 4]."""
+    rotation = b[:, :3] @ a[:, :3].T
+    return np.column_stack([rotation, b[:, 3] - rotation @ a[:, 3]])
+
+
 def posed_images(reconstruction: pycolmap.Reconstruction) -> dict[str, ModelImage]:
     """The registered images of a pycolmap.Reconstruction, by name."""
     return {

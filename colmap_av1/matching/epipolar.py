@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.geometry.colmap_model import relative_pose
 from colmap_av1.geometry.posed_camera import PosedCamera
 from colmap_av1.util.arrays import Bools, Floats
 
@@ -75,9 +76,9 @@ def essential_of_poses(a: Floats, b: Floats) -> Floats:
     Returns:
         float64 [3, 3] in normalised coordinates.
     """
-    rotation = b[:, :3] @ a[:, :3].T
-    x, y, z = b[:, 3] - rotation @ a[:, 3]
-    return np.asarray(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation)
+    relative = relative_pose(a, b)
+    x, y, z = relative[:, 3]
+    return np.asarray(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:, :3])
 
 
 def error_by_poses(

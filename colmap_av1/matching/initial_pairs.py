@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_av1.geometry.colmap_model import relative_pose
 from colmap_av1.matching.growth import Growth
 from colmap_av1.matching.initial_pair_trial import InitialPairTrial, try_initial_pair
 from colmap_av1.matching.mapper_limits import (
@@ -479,7 +480,7 @@ def _known_pose(models: Sequence[Sequence[Floats | None]], pair: Sequence[int]) 
     for cam_from_world in models:
         first, second = (cam_from_world[image] for image in pair)
         if first is not None and second is not None:
-            rotation = second[:, :3] @ first[:, :3].T
-            step = second[:, 3] - rotation @ first[:, 3]
-            return np.column_stack([rotation, step / max(float(np.linalg.norm(step)), 1e-12)])
+            pose = relative_pose(first, second)
+            pose[:, 3] /= max(float(np.linalg.norm(pose[:, 3])), 1e-12)
+            return pose
     return None

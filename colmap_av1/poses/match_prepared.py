@@ -25,20 +25,21 @@ def wants_joint_estimate(options: MatchOptions, *, writes_images: bool) -> bool:
     Raises:
         OptionError: `options.verify` requires it, but another option does not allow it.
     """
-    verify, pairs = options.verify.verify, PairOptions(min_matches=options.pairs.min_matches)
-    each = options.camera.single_camera is False
-    if verify == "joint" and each:
+    verify = options.verify.verify
+    chooses_pairs = options.pairs != PairOptions(min_matches=options.pairs.min_matches)
+    has_own_cameras = options.camera.single_camera is False
+    if verify == "joint" and has_own_cameras:
         raise OptionError(
             "verify is 'joint', which estimates one camera for all images of a video: leave out "
             "--single_camera, or give --verify pairs"
         )
-    if verify == "joint" and options.pairs != pairs:
+    if verify == "joint" and chooses_pairs:
         raise OptionError(
             "verify is 'joint', which chooses the pairs itself: leave out --offsets, --growth and "
             "--max_span, or give --verify pairs"
         )
     if verify == "auto":
-        return writes_images and not each and options.pairs == pairs
+        return writes_images and not has_own_cameras and not chooses_pairs
     return verify == "joint"
 
 

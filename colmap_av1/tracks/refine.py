@@ -136,19 +136,31 @@ class RefinedTracks:
     """The state of every track after some of the frames.
 
     Attributes:
+        tracks: the tracks before refinement.
+        options: how to refine.
+        track: int64 [num_observations] index of the track of each observation.
+        is_first: bool [num_observations] the first observation of each track.
+        is_last: bool [num_observations] the last observation of each track.
+        is_located: bool [num_observations] observed or found, so that the picture there shows the
+            track.
+        step: float32 [num_observations, 2] the bitstream's motion from the previous observation.
+        step_variance: float64 [num_observations] growth of the variance in this step.
+        bitstream_variance: float64 [num_observations] variance before refinement.
         xy: float32 [num_observations, 2] corrected positions in pixels.
         variance: float64 [num_observations] their expected variance in px^2.
-        confirmed: bool [num_observations].
-        bitstream_variance: float64 [num_observations] variance before refinement.
+        confirmed: bool [num_observations], see `Tracks`.
+        templates: the patches to find.
+        last_image: the grey picture of the last frame; None before the first.
+        last_frame: display index of this frame; -1 before the first.
     """
 
     tracks: Tracks
     options: RefineOptions
-    track: Ints  # of each observation
+    track: Ints
     is_first: Bools
     is_last: Bools
-    is_located: Bools  # observed or found, so that the picture there shows the track
-    step: NDArray[np.float32]  # the bitstream's motion from the previous observation
+    is_located: Bools
+    step: NDArray[np.float32]
     step_variance: Floats
     bitstream_variance: Floats
     xy: NDArray[np.float32]
