@@ -147,8 +147,8 @@ class Seams:
         """Warning about disconnected seams."""
         if not self.disconnected:
             return None
-        where = min(self.disconnected, key=lambda i: (int(self.num_points[i]), i))
-        (first, second), count = self.pairs[where], int(self.num_points[where])
+        where = min(self.disconnected, key=lambda i: (int(self.num_elsewhere[i]), i))
+        (first, second), count = self.pairs[where], int(self.num_elsewhere[where])
         more = len(self.disconnected) - 1
         others = f", and few at {more} more {'place' if more == 1 else 'places'}" if more else ""
         usual = int(np.median(self.num_points))
