@@ -35,8 +35,8 @@ _LEAST_FITTING = 0.4
 # Fewer tracks or points show nothing.
 _FEWEST = 30
 # A camera moves too fast across a seam if its speed exceeds this multiple of this quantile of its
-# speed elsewhere in the video. On 21 rendered walks, it was 2.2 where false links
-# bent the model, and at most 0.54 at other seams without tracks and with few points.
+# speed elsewhere in the video. On 21 rendered walks, it was 2.2 where false links bent the model,
+# and at most 0.54 at other seams without tracks and with few points.
 _TOO_FAST, _SPEED_QUANTILE = 1.5, 0.9
 # A camera leaps if it is this much faster. On 12 rendered walks, it was 8.3 times as fast where a
 # model of few images was bent in a turn, and at most 1.7 times elsewhere.
