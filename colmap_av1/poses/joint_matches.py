@@ -52,7 +52,7 @@ from colmap_av1.video.coded_size import smaller_grey
 # An observation of the adjusted model is an outlier if its error exceeds both this many pixels and
 # this multiple of the median error, which is larger with a rolling shutter, for example. SIFT
 # features of links are less accurate than corners, and where there are links, there is little else.
-_LEAST_ERROR, _LEAST_ERROR_OF_LINKS, _MEDIAN_ERRORS = 0.6, 1.5, 4.0
+_LEAST_ERROR, _LEAST_ERROR_OF_LINKS, _MEDIAN_ERRORS = 0.6, 1.0, 4.0
 # Points of motion tracks need the mapper's smallest triangulation angle, and a depth error below
 # 50 %.
 _POINTS = TriangulateOptions(
